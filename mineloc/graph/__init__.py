@@ -1,0 +1,1 @@
+"""The pose factor graph; the only room that knows gtsam."""

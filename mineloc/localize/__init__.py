@@ -1,0 +1,1 @@
+"""The methods, each readable in a minute."""

@@ -1,0 +1,1 @@
+"""Front ends: from sweeps to poses, keyframes and relative pose factors."""

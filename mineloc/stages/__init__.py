@@ -1,0 +1,1 @@
+"""One function a stage: paths and configuration in, paths out."""

@@ -1,0 +1,1 @@
+"""Content-addressed objects, manifests, lineage and locks."""

@@ -1,0 +1,1 @@
+"""What is done to one sweep before anybody interprets it: filters, deskew, voxel grid."""

@@ -1,0 +1,1 @@
+"""Rerun recordings; the only room that knows rerun."""
