@@ -1,0 +1,258 @@
+"""Reading a canonical flight: facts at once, measurements as streams."""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from collections.abc import Generator, Iterable
+from pathlib import Path
+from types import TracebackType
+from typing import cast
+
+import numpy as np
+from mcap.records import Channel
+
+from mineloc.data import Calibration, FlightInfo, ImuSamples, Sweep, Trajectory
+from mineloc.errors import FlightError, IngestError
+from mineloc.io import canonical
+from mineloc.io import flight_layout as layout
+from mineloc.io.background import prefetched
+from mineloc.io.mcap_chunks import RawRecord, ordered_messages, read_attachment, read_summary
+from mineloc.io.ros import POINT_CLOUD2
+
+# Decoded this far ahead of the consumer: a few megabytes.
+_AHEAD = 4
+# A sweep waits this long for inertial samples that do not come.
+_PATIENCE_NS = 300_000_000
+
+_Item = Sweep | RawRecord
+
+
+class FlightReader:
+    """Reads one flight file. Every checksum is checked; memory does not grow with the flight.
+
+    Attributes:
+        path: the file.
+        info: who flew what, where and when.
+        calibration: where the sensors sit.
+        health: what ingest found out; empty when it was not ingested (simulated).
+        sweep_count: number of sweeps.
+        first_ns, last_ns: times of the first and the last measurement.
+
+    Raises:
+        IngestError: not a canonical flight, or damaged.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path)
+        try:
+            self._stream = self.path.open("rb")
+        except OSError as error:
+            raise IngestError(path, error.strerror or "cannot be read", todo="check the path") from None
+        try:
+            self._load()
+        except BaseException:
+            self._stream.close()
+            raise
+
+    def _load(self) -> None:
+        summary, reader = read_summary(self.path, self._stream)
+        try:
+            records = {record.name: record.metadata for record in reader.iter_metadata()}
+        except Exception as error:
+            raise IngestError(
+                self.path, f"metadata are damaged ({type(error).__name__})", todo="run mineloc ingest again"
+            ) from error
+        if layout.FLIGHT_RECORD not in records:
+            raise IngestError(
+                self.path,
+                f"no {layout.FLIGHT_RECORD} record",
+                expected="a canonical flight",
+                todo="run mineloc ingest first",
+            )
+        facts = layout.decode_info(self.path, records[layout.FLIGHT_RECORD])
+        self.info: FlightInfo = facts[0]
+        self.calibration: Calibration = facts[1]
+        self.first_ns, self.last_ns = facts[2:]
+        health = records.get(layout.HEALTH_RECORD, {}).get("json", "{}")
+        self.health = cast("dict[str, object]", json.loads(health))
+        self._summary = summary
+        counts = summary.statistics.channel_message_counts if summary.statistics else {}
+        self.sweep_count = sum(counts.get(c.id, 0) for c in self._channels(layout.POINTS))
+
+    def __enter__(self) -> FlightReader:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._stream.close()
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds from the first to the last measurement."""
+        return (self.last_ns - self.first_ns) * 1e-9
+
+    def sweeps(self, start_ns: int | None = None, end_ns: int | None = None) -> Generator[Sweep]:
+        """The sweeps that start in `[start_ns, end_ns)`, read ahead by a background thread.
+
+        Raises:
+            FlightError: a sweep does not start later than the one before.
+            IngestError: a damaged chunk.
+        """
+        for item in prefetched(self._items(layout.POINTS, start_ns=start_ns, end_ns=end_ns), depth=_AHEAD):
+            sweep = cast("Sweep", item)
+            if end_ns is not None and sweep.stamp_ns >= end_ns:
+                return
+            if start_ns is None or sweep.stamp_ns >= start_ns:
+                yield sweep
+
+    def imu(self) -> ImuSamples:
+        """All inertial samples.
+
+        Raises:
+            FlightError: their times do not increase.
+            IngestError: a damaged chunk, or samples in a layout that mineloc does not write.
+        """
+        return self._decode_imu([cast("RawRecord", item) for item in self._items(layout.IMU_TOPIC)])
+
+    def reference(self) -> Trajectory | None:
+        """The reference `T_map_body`, None when the flight has none.
+
+        Raises:
+            FlightError: its times do not increase.
+            IngestError: a damaged chunk, or poses in a layout that mineloc does not write.
+        """
+        return self._poses(layout.POSE, canonical.pose_layout(layout.MAP), layout.MAP)
+
+    def odometry(self) -> Trajectory | None:
+        """The odometry that came with the recording, `T_odom_body`; None when there was none."""
+        made = canonical.odometry_layout(layout.ODOM_FRAME, layout.BODY)
+        return self._poses(layout.ODOM, made, layout.ODOM_FRAME)
+
+    def steps(self) -> Generator[tuple[Sweep, ImuSamples]]:
+        """Every sweep with its inertial samples, in one pass.
+
+        A sample is given once: with the first sweep that ends at or after it, or, when it is the first one at or past
+        that sweep's end, with that sweep too early rather than too late. So the samples of a step reach at least up
+        to `sweep.end_ns` wherever the flight has samples within 0.3 s of it.
+
+        Raises:
+            FlightError: time goes backwards or repeats.
+            IngestError: a damaged chunk.
+        """
+        held: deque[Sweep] = deque()
+        samples: list[RawRecord] = []
+        for item in prefetched(self._items(layout.POINTS, layout.IMU_TOPIC), depth=4 * _AHEAD):
+            now_ns = item.end_ns if isinstance(item, Sweep) else item.log_ns
+            while held and now_ns > held[0].end_ns + _PATIENCE_NS:
+                yield held.popleft(), self._decode_imu(samples)
+                samples = []
+            if isinstance(item, Sweep):
+                held.append(item)
+                if not (samples and samples[-1].log_ns >= item.end_ns):
+                    continue
+            else:
+                samples.append(item)
+            while held and samples and samples[-1].log_ns >= held[0].end_ns:
+                yield held.popleft(), self._decode_imu(samples)
+                samples = []
+        while held:
+            yield held.popleft(), self._decode_imu(samples)
+            samples = []
+
+    def attachment(self, name: str) -> bytes:
+        """The content of an attached file.
+
+        Raises:
+            KeyError: no such attachment.
+            IngestError: damaged.
+        """
+        for index in self._summary.attachment_indexes:
+            if index.name == name:
+                return read_attachment(self.path, self._stream, index).data
+        raise KeyError(name)
+
+    @property
+    def attachment_names(self) -> tuple[str, ...]:
+        """Names of the attached files."""
+        return tuple(index.name for index in self._summary.attachment_indexes)
+
+    def _channels(self, topic: str) -> list[Channel]:
+        return [c for c in self._summary.channels.values() if c.topic == topic]
+
+    def _items(self, *topics: str, start_ns: int | None = None, end_ns: int | None = None) -> Generator[_Item]:
+        """Messages of the topics in order of log time, sweeps decoded."""
+        channels = {c.id: c for topic in topics for c in self._channels(topic)}
+        chunks = [
+            index
+            for index in self._summary.chunk_indexes
+            if not channels.keys().isdisjoint(index.message_index_offsets)
+            and (start_ns is None or index.message_end_time >= start_ns)
+        ]
+        last_ns: int | None = None
+        for record in ordered_messages(self.path, chunks, channels):
+            channel = channels[record.channel]
+            if channel.topic != layout.POINTS:
+                yield record
+                continue
+            sweep = self._decode_sweep(record, channel)
+            if last_ns is not None and sweep.stamp_ns <= last_ns:
+                raise self._disorder(layout.POINTS, last_ns, sweep.stamp_ns)
+            last_ns = sweep.stamp_ns
+            yield sweep
+            if end_ns is not None and sweep.stamp_ns >= end_ns:
+                return
+
+    def _decode_sweep(self, record: RawRecord, channel: Channel) -> Sweep:
+        try:
+            period_ns = int(channel.metadata[layout.PERIOD_KEY])
+            return canonical.decode_sweep(record.data, period_ns=period_ns)
+        except Exception as error:
+            raise self._foreign(layout.POINTS, POINT_CLOUD2) from error
+
+    def _decode_imu(self, records: list[RawRecord]) -> ImuSamples:
+        if not records:
+            return ImuSamples.empty()
+        self._need_order(layout.IMU_TOPIC, records)
+        try:
+            return canonical.decode_imu([r.data for r in records])
+        except ValueError as error:
+            raise self._foreign(layout.IMU_TOPIC, "Imu") from error
+
+    def _poses(self, topic: str, made: canonical.CdrLayout, parent: str) -> Trajectory | None:
+        records = [cast("RawRecord", item) for item in self._items(topic)]
+        if not records:
+            return None
+        self._need_order(topic, records)
+        try:
+            return canonical.decode_poses([r.data for r in records], made, parent=parent, child=layout.BODY)
+        except ValueError as error:
+            raise self._foreign(topic, "pose") from error
+
+    def _need_order(self, topic: str, records: Iterable[RawRecord]) -> None:
+        logged = np.array([record.log_ns for record in records])
+        bad = np.flatnonzero(np.diff(logged) <= 0)
+        if len(bad):
+            raise self._disorder(topic, int(logged[bad[0]]), int(logged[bad[0] + 1]))
+
+    def _disorder(self, topic: str, before_ns: int, now_ns: int) -> FlightError:
+        what = "repeats" if now_ns == before_ns else "goes backwards"
+        return FlightError(
+            self.path,
+            f"time {what} on {topic}: {now_ns} ns after {before_ns} ns",
+            expected="increasing times",
+            todo="run mineloc ingest on the recording again",
+        )
+
+    def _foreign(self, topic: str, what: str) -> IngestError:
+        return IngestError(
+            self.path,
+            f"{topic} holds a {what} message that mineloc did not write",
+            expected="a canonical flight",
+            todo="run mineloc ingest first",
+        )
