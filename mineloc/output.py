@@ -29,7 +29,7 @@ def new_file(path: Path, *, overwrite: bool = False) -> Generator[Path]:
     if path.is_dir():
         raise OutputError(path, "is a folder", expected="a file name", todo="choose another --out")
     _refuse_existing(path, overwrite=overwrite)
-    with _one_line_errors(path):
+    with one_line_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(prefix=TEMP_PREFIX, suffix=path.suffix, dir=path.parent)
         os.close(handle)
@@ -58,7 +58,7 @@ def new_folder(path: Path, *, overwrite: bool = False) -> Generator[Path]:
         raise OutputError(path, "is a file", expected="a folder name", todo="choose another --out")
     if path.is_dir() and any(path.iterdir()):
         _refuse_existing(path, overwrite=overwrite)
-    with _one_line_errors(path):
+    with one_line_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         temp = Path(tempfile.mkdtemp(prefix=TEMP_PREFIX, dir=path.parent))
         try:
@@ -104,7 +104,8 @@ def _refuse_existing(path: Path, *, overwrite: bool) -> None:
 
 
 @contextmanager
-def _one_line_errors(path: Path) -> Generator[None]:
+def one_line_errors(path: Path) -> Generator[None]:
+    """Within: a full disk, a missing permission or a failing device becomes one `OutputError` line about `path`."""
     try:
         yield
     except OSError as error:
