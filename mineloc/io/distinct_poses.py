@@ -12,24 +12,23 @@ from mineloc.errors import FormatError
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DistinctPoses:
-    """Poses with strictly rising times.
+    """Poses with strictly rising times: the first of each time.
 
     Attributes:
         stamps_ns: (n,) int64, strictly increasing.
         values: (n, 7) position and xyzw quaternion as they were.
-        duplicates: rows left out since they repeat the row before, time and pose.
-        ties: rows with another pose for the time of the row before. They stay, 1 ns later: which of them is right
-            nobody can tell, and the nearest in time to any other clock is found as if they stood side by side.
+        duplicates: rows left out that repeat the pose before them.
+        conflicts: rows left out that give another pose for a time that has one.
     """
 
     stamps_ns: I64
     values: F64
     duplicates: int
-    ties: int
+    conflicts: int
 
 
-def tell_apart(where: str, stamps_ns: I64, values: F64) -> DistinctPoses:
-    """Make non-decreasing stamps strictly increasing.
+def first_of_each_time(where: str, stamps_ns: I64, values: F64) -> DistinctPoses:
+    """Make non-decreasing stamps strictly increasing by leaving out rows.
 
     Args:
         where: for the error.
@@ -39,20 +38,15 @@ def tell_apart(where: str, stamps_ns: I64, values: F64) -> DistinctPoses:
     Raises:
         FormatError: so many poses share their times that the times have lost their digits.
     """
-    if len(stamps_ns) < 2:
-        return DistinctPoses(stamps_ns, values, 0, 0)
-    tied = np.diff(stamps_ns, prepend=stamps_ns[0] - 1) == 0
-    repeated = tied.copy()
-    repeated[1:] &= (values[1:] == values[:-1]).all(axis=1)
-    stamps, kept = stamps_ns[~repeated], values[~repeated]
-    ties = int(tied[~repeated].sum())
-    if ties > 0.75 * len(stamps):
+    again = np.diff(stamps_ns, prepend=stamps_ns[:1] - 1) == 0
+    same = again.copy()
+    same[1:] &= (values[1:] == values[:-1]).all(axis=1)
+    conflicts = int((again & ~same).sum())
+    if conflicts > 0.75 * len(stamps_ns):
         raise FormatError(
             where,
-            f"{len(stamps)} poses have only {len(stamps) - ties} different times",
+            f"{len(stamps_ns)} poses have only {int((~again).sum())} different times",
             expected="a time a pose",
             todo="write the times with more digits",
         )
-    count = np.arange(len(stamps))
-    # each at least 1 ns after the one before
-    return DistinctPoses(np.maximum.accumulate(stamps - count) + count, kept, int(repeated.sum()), ties)
+    return DistinctPoses(stamps_ns[~again], values[~again], int(same.sum()), conflicts)

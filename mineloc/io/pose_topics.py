@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from mineloc import se3
 from mineloc.data import Trajectory
 from mineloc.errors import FormatError, MinelocError
-from mineloc.io.distinct_poses import tell_apart
+from mineloc.io.distinct_poses import first_of_each_time
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 _POSE_OF: Mapping[str, Callable[[Any], Any]] = {
@@ -28,12 +28,12 @@ FLIGHT_POSE_TOPIC = "/pose"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseTopic:
-    """The poses of one topic; `duplicates` and `ties` as in `DistinctPoses`."""
+    """The poses of one topic; `duplicates` and `conflicts` as in `DistinctPoses`."""
 
     trajectory: Trajectory
     topic: str
     duplicates: int
-    ties: int
+    conflicts: int
 
 
 def read_pose_topic(path: Path, topic: str | None = None) -> PoseTopic:
@@ -144,7 +144,7 @@ def _checked(
     # Messages may be recorded out of order; each knows its own time.
     order = np.argsort(t, kind="stable")
     t, v = t[order], v[order]
-    distinct = tell_apart(where, t, v)
+    distinct = first_of_each_time(where, t, v)
     poses = se3.from_xyzw(distinct.values[:, :3], distinct.values[:, 3:]) if len(t) else np.zeros((0, 4, 4))
     trajectory = Trajectory(distinct.stamps_ns, poses, parent=parent, child=child)
-    return PoseTopic(trajectory, topic, distinct.duplicates, distinct.ties)
+    return PoseTopic(trajectory, topic, distinct.duplicates, distinct.conflicts)

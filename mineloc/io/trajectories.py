@@ -19,7 +19,7 @@ import numpy as np
 from mineloc import se3
 from mineloc.data import F64, Trajectory
 from mineloc.errors import FormatError
-from mineloc.io.distinct_poses import DistinctPoses, tell_apart
+from mineloc.io.distinct_poses import DistinctPoses, first_of_each_time
 from mineloc.io.pose_topics import read_pose_topic
 from mineloc.output import new_file
 
@@ -41,15 +41,15 @@ class LoadedTrajectory:
         trajectory: what was read.
         source: the file, with `:/topic` for a recording.
         kind: the format that it turned out to be.
-        duplicates: poses that were there twice, same time and same pose, and are kept once.
-        ties: other poses for a time that already had one; they are kept, a nanosecond apart.
+        duplicates: poses that were there twice, same time and same pose; kept once.
+        conflicts: other poses for a time that already had one; the first is kept.
     """
 
     trajectory: Trajectory
     source: str
     kind: Kind
     duplicates: int = 0
-    ties: int = 0
+    conflicts: int = 0
 
 
 def read_trajectory(spec: str | Path) -> Trajectory:
@@ -73,7 +73,7 @@ def load_trajectory(spec: str | Path) -> LoadedTrajectory:
         raise FormatError(path, "is a folder", expected="a trajectory file", todo="name the file in it")
     if topic is not None or path.suffix == ".mcap":
         found = read_pose_topic(path, topic)
-        return LoadedTrajectory(found.trajectory, f"{path}:{found.topic}", "mcap", found.duplicates, found.ties)
+        return LoadedTrajectory(found.trajectory, f"{path}:{found.topic}", "mcap", found.duplicates, found.conflicts)
     if path.suffix in (".bag", ".db3"):
         raise FormatError(
             path, "is a recording", expected="TUM, KITTI or MCAP", todo="make a flight of it first: mineloc ingest"
@@ -82,7 +82,7 @@ def load_trajectory(spec: str | Path) -> LoadedTrajectory:
     number, first = rows[0]
     if len(first) == 8:
         distinct = _parse_tum(path, rows)
-        return LoadedTrajectory(_trajectory(distinct), str(path), "tum", distinct.duplicates, distinct.ties)
+        return LoadedTrajectory(_trajectory(distinct), str(path), "tum", distinct.duplicates, distinct.conflicts)
     if len(first) == 12:
         return LoadedTrajectory(_parse_kitti(path, rows), str(path), "kitti")
     raise FormatError(
@@ -223,7 +223,7 @@ def _parse_tum(path: Path, rows: list[tuple[int, list[str]]]) -> DistinctPoses:
             expected="rising times",
             todo="sort the file or remove the line",
         )
-    return tell_apart(str(path), stamps, values)
+    return first_of_each_time(str(path), stamps, values)
 
 
 def _parse_kitti(path: Path, rows: list[tuple[int, list[str]]]) -> Trajectory:

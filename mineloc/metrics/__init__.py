@@ -1,1 +1,1 @@
-"""How far an estimate is from a reference."""
+"""How far an estimate is from a reference (METHOD 8)."""

@@ -98,7 +98,7 @@ def test_messages_out_of_order_repeated_and_tied(tmp_path):
     a, b, c = _poses(3)
     tied = (b[0], c[1])
     found = read_pose_topic(_record(tmp_path / "r.mcap", [("/p", POSE_STAMPED, [b, a, b, c, tied])]))
-    assert (found.duplicates, found.ties) == (1, 1)
+    assert (found.duplicates, found.conflicts) == (1, 1)
     assert found.trajectory.stamps_ns.tolist() == [a[0], b[0], b[0] + 1, c[0]]
     np.testing.assert_allclose(found.trajectory.poses, [a[1], b[1], c[1], c[1]], atol=1e-12)
 
@@ -138,5 +138,5 @@ def test_real_recordings():
         pytest.skip("no ../shared/data beside the repository")
     loaded = load_trajectory(f"{folder}/evo_glim_1.mcap:/lidarodom/ground_truth/pose")
     # motion capture that gives its clock once for two poses
-    assert (len(loaded.trajectory), loaded.ties) == (5003, 1949)
+    assert (len(loaded.trajectory), loaded.conflicts) == (5003, 1949)
     assert load_trajectory(f"{folder}/evo_glim_2.mcap:/glim_ros_node/odom").trajectory.child == "imu"
