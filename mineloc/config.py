@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterable, Mapping
+from copy import deepcopy
 from pathlib import Path
 from typing import Any, Literal, TypeVar, cast
 
@@ -35,6 +36,36 @@ class IngestConfig(Section):
     gap_factor: float = Field(default=1.8, gt=1, description="a pause longer than this many periods is a gap")
 
 
+class SimulateConfig(Section):
+    """A flight that never took place: tour, drone, sensors and their errors."""
+
+    length_m: float = Field(default=1000.0, gt=0, description="path length of the flight")
+    speed_mps: float = Field(default=2.5, gt=0, le=15, description="on straight roadways; slower in bends")
+    accel_mps2: float = Field(default=1.2, gt=0, le=10)
+    yaw_rate_degps: float = Field(default=60.0, gt=0, le=360)
+    hover_s: float = Field(default=4.0, ge=1, description="at rest before the start and after the end")
+    clearance_m: float = Field(default=0.7, gt=0, description="wanted distance to walls; half of it is the least")
+    sway_m: float = Field(default=0.15, ge=0, description="standard deviation of the wander off the line")
+    vibration_mps2: float = Field(default=0.5, ge=0, description="root mean square an axis")
+    vibration_degps: float = Field(default=1.5, ge=0, description="root mean square an axis")
+    seed: int = Field(default=0, ge=0)
+    sensor: Literal["vlp16", "rs16", "hdl32e", "os0"] = "vlp16"
+    lidar_hz: float = Field(default=10.0, ge=2, le=20, description="revolutions a second")
+    grazing_noise: float = Field(
+        default=0.0009, ge=0, description="growth of the range noise: metres a metre and tan(incidence)"
+    )
+    loss: float = Field(default=0.005, ge=0, lt=1, description="share of shots lost by chance")
+    dust: float = Field(default=0.0, ge=0, lt=1, description="share of shots that meet dust")
+    dust_depth_m: float = Field(default=1.5, gt=0, description="mean depth at which dust returns")
+    imu_hz: float = Field(default=200.0, ge=50, le=1000)
+    gyro_noise_degps_rthz: float = Field(default=0.007, ge=0)
+    gyro_bias_degps: float = Field(default=0.2, ge=0)
+    gyro_walk_degps2_rthz: float = Field(default=0.0005, ge=0)
+    accel_noise_mps2_rthz: float = Field(default=0.002, ge=0)
+    accel_bias_mps2: float = Field(default=0.03, ge=0)
+    accel_walk_mps3_rthz: float = Field(default=0.0002, ge=0)
+
+
 class SweepConfig(Section):
     """What is dropped from a sweep before anything looks at it."""
 
@@ -59,6 +90,38 @@ class OdometryConfig(Section):
 class LoamConfig(Section):
     """The LOAM front end as published (METHOD 4.1, A-LOAM, VLP-16 launch values)."""
 
+    curvature_threshold_m2: float = Field(default=0.1, gt=0, description="edges above, planes below; not normalised")
+    sectors: int = Field(default=6, ge=1, description="equal parts of a ring that features are picked from")
+    sharp_per_sector: int = Field(default=2, ge=1)
+    less_sharp_per_sector: int = Field(default=20, ge=1, description="the sharp ones among them")
+    flat_per_sector: int = Field(default=4, ge=1)
+    less_flat_voxel_m: float = Field(default=0.2, gt=0)
+    neighbour_gap_m2: float = Field(default=0.05, gt=0, description="suppression ends at a larger squared gap")
+    reject_unreliable: bool = Field(
+        default=True, description="leave out occluded points and surfaces along the beam (LOAM; A-LOAM dropped it)"
+    )
+    huber_m: float = Field(default=0.1, gt=0)
+    odometry_rounds: int = Field(default=2, ge=1, description="times that sweep-to-sweep matches are sought")
+    odometry_iterations: int = Field(default=4, ge=1)
+    odometry_distance_m: float = Field(default=5.0, gt=0)
+    odometry_rings: float = Field(default=2.5, ge=1, description="points of a line or plane are at most so far apart")
+    odometry_min_matches: int = Field(default=10, ge=6)
+    mapping_rounds: int = Field(default=2, ge=1)
+    mapping_iterations: int = Field(default=4, ge=1)
+    mapping_min_matches: int = Field(default=50, ge=6)
+    corner_leaf_m: float = Field(default=0.2, ge=0.1)
+    surface_leaf_m: float = Field(default=0.4, ge=0.1)
+    neighbour_distance_m: float = Field(default=1.0, gt=0, le=2, description="the fifth neighbour must be nearer")
+    line_eigenvalue_ratio: float = Field(default=3.0, ge=1)
+    plane_tolerance_m: float = Field(default=0.2, gt=0)
+    odometry_min_eigenvalue: float = Field(
+        default=0.0, ge=0, description="weaker directions keep the prediction (LOAM: 10); 0 is off, as in A-LOAM"
+    )
+    mapping_min_eigenvalue: float = Field(default=0.0, ge=0, description="as odometry_min_eigenvalue (LOAM: 100)")
+    max_prediction_s: float = Field(
+        default=1.0, gt=0, description="the last velocity is believed for so long, then the drone counts as hovering"
+    )
+
 
 class GraphConfig(Section):
     """The pose factor graph."""
@@ -68,6 +131,9 @@ class EvaluateConfig(Section):
     """Comparison with a reference."""
 
     max_time_difference_s: float = Field(default=0.01, gt=0)
+    shown_alignment: Literal["auto", "none", "origin", "se3"] = Field(
+        default="auto", description="under which report and viewer draw: auto is none in a prior map, else origin"
+    )
 
 
 class ReportConfig(Section):
@@ -80,12 +146,15 @@ class ViewConfig(Section):
     """The Rerun recording."""
 
     sweep_stride: int = Field(default=5, ge=1, description="every n-th sweep is shown")
+    sweep_points: int = Field(default=1_000_000, ge=1000, description="points of all shown sweeps together, at most")
+    map_points: int = Field(default=250_000, ge=1000, description="points of the mine, at most")
 
 
 class Config(Section):
     """All sections. Each stage depends only on the sections that it names."""
 
     ingest: IngestConfig = IngestConfig()
+    simulate: SimulateConfig = SimulateConfig()
     sweep: SweepConfig = SweepConfig()
     keyframe: KeyframeConfig = KeyframeConfig()
     odometry: OdometryConfig = OdometryConfig()
@@ -103,9 +172,21 @@ def load_config(path: Path | None = None, overrides: Iterable[str] = ()) -> Conf
         ConfigError: no such file, not TOML, an unknown key, a value that does not fit.
     """
     raw: dict[str, Any] = read_toml(path) if path is not None else {}
+    return layered_config([raw], overrides, where=str(path) if path is not None else "--set")
+
+
+def layered_config(layers: Iterable[Mapping[str, Any]], overrides: Iterable[str] = (), *, where: str) -> Config:
+    """Defaults, then sections laid one over the other key by key, then `section.key=value` overrides.
+
+    Raises:
+        ConfigError: an unknown key, a value that does not fit.
+    """
+    raw: dict[str, Any] = {}
+    for layer in layers:
+        _lay_over(raw, layer)
     for text in overrides:
         _override(raw, text)
-    return validate(Config, raw, where=str(path) if path is not None else "--set")
+    return validate(Config, raw, where=where)
 
 
 def validate(model: type[T], raw: Mapping[str, Any], *, where: str) -> T:
@@ -138,6 +219,15 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(path, "no such file", expected="a TOML file", todo="check the path") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as error:
         raise ConfigError(path, f"not TOML ({error})", expected="a TOML file", todo="correct the file") from None
+
+
+def _lay_over(raw: dict[str, Any], layer: Mapping[str, Any]) -> None:
+    for key, value in layer.items():
+        below = raw.get(key)
+        if isinstance(below, dict) and isinstance(value, dict):
+            _lay_over(cast("dict[str, Any]", below), cast("dict[str, Any]", value))
+        else:
+            raw[key] = deepcopy(value)
 
 
 def _override(raw: dict[str, Any], text: str) -> None:
