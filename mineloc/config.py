@@ -10,9 +10,9 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from copy import deepcopy
 from pathlib import Path
-from typing import Any, Literal, TypeVar, cast
+from typing import Annotated, Any, Literal, TypeVar, cast
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, ValidationError
 
 from mineloc.errors import ConfigError
 
@@ -130,7 +130,19 @@ class GraphConfig(Section):
 class EvaluateConfig(Section):
     """Comparison with a reference."""
 
+    association: Literal["auto", "nearest", "interpolate"] = Field(
+        default="auto", description="auto takes the nearest pose, but interpolates the reference where the rates differ"
+    )
     max_time_difference_s: float = Field(default=0.01, gt=0)
+    max_reference_gap_s: float = Field(default=0.5, gt=0, description="no interpolation over longer gaps")
+    max_gap_s: float = Field(default=1.0, gt=0, description="longer gaps of the estimate are not covered")
+    rep_percents: tuple[Annotated[float, Field(gt=0, le=100)], ...] = (20.0, 40.0, 60.0, 80.0, 100.0)
+    segment_lengths_m: tuple[PositiveFloat, ...] = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+    segment_step: int = Field(default=10, ge=1, description="a segment starts every so many poses (KITTI)")
+    rpe_frames: tuple[PositiveInt, ...] = (1,)
+    rpe_lengths_m: tuple[PositiveFloat, ...] = (100.0,)
+    rpe_all_pairs: bool = False
+    rpe_tolerance: float = Field(default=0.1, gt=0, lt=1)
     shown_alignment: Literal["auto", "none", "origin", "se3"] = Field(
         default="auto", description="under which report and viewer draw: auto is none in a prior map, else origin"
     )
