@@ -20,6 +20,7 @@ from mineloc.io.recording import Damage, Decoder, RawMessage, Topic, refuse
 
 # A bag's chunk is as large as `rosbag record --chunksize` made it, 768 KiB unless told otherwise.
 _MAX_CHUNK_BYTES = 512 << 20
+_NO_NOTES: Mapping[str, str] = {}
 _SCHEMAS = {MessageDefinitionFormat.MSG: "msg", MessageDefinitionFormat.IDL: "idl", MessageDefinitionFormat.NONE: "msg"}
 
 
@@ -90,7 +91,7 @@ class BagRecording:
             except Exception as error:  # noqa: BLE001  # as above
                 self._refuse(error, f"reading message {count + 1}")
             count += 1
-            yield RawMessage(self.topics[connection.topic], log_ns, data, decoders[connection.topic])
+            yield RawMessage(self.topics[connection.topic], log_ns, data, decoders[connection.topic], _NO_NOTES)
 
     def _decoder(self, connection: Connection) -> Decoder:
         topic = self.topics[connection.topic]

@@ -36,6 +36,7 @@ _NS = 1e-9
 
 # log time, number of the segment, place in it: sorted so, equal times keep the file's order
 _Waiting = tuple[int, int, int, RawMessage]
+_Wanted = tuple[Topic, Decoder, dict[str, str]]
 _Loaded = tuple[Segment, bytes | memoryview | RecordError]
 
 
@@ -89,7 +90,7 @@ class McapRecording:
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """The messages of some topics in the order of their log times, chunk by chunk, decompressed a little ahead."""
         wanted = {
-            channel.id: (self.topics[channel.topic], self._decoder(channel))
+            channel.id: (self.topics[channel.topic], self._decoder(channel), channel.metadata)
             for channel in self._index.channels.values()
             if channel.topic in topics
         }
@@ -205,7 +206,7 @@ def _plain(file: BinaryIO, segment: Segment) -> bytes | memoryview:
 def _messages_of(
     number: int,
     plain: bytes | memoryview | RecordError,
-    wanted: dict[int, tuple[Topic, Decoder]],
+    wanted: dict[int, _Wanted],
     delivered: dict[int, int],
 ) -> list[_Waiting]:
     if isinstance(plain, RecordError):
@@ -215,7 +216,7 @@ def _messages_of(
     for channel_id, log_ns, data in messages_in(plain):
         known = wanted.get(channel_id)
         if known is not None:
-            found.append((log_ns, number, len(found), RawMessage(known[0], log_ns, data, known[1])))
+            found.append((log_ns, number, len(found), RawMessage(known[0], log_ns, data, known[1], known[2])))
             counts[channel_id] = counts.get(channel_id, 0) + 1
     # only now: a chunk that turns out damaged half-way delivers nothing
     for channel_id, count in counts.items():

@@ -259,8 +259,9 @@ class _Scan:
         starts = [(s.offset, s.start_ns) for s in self.index.segments]
         starts += [(hole.offset, hole.head.start_ns) for hole in self.lost if hole.head is not None]
         ends = [(s.offset, s.end_ns) for s in self.index.segments]
-        for hole in self._merged_holes():
-            self.index.damage.append(self._estimated(hole.damage(starts, ends)))
+        damage = [hole.damage(starts, ends) for hole in self._merged_holes()]
+        holes_s = sum(d.seconds or 0.0 for d in damage if not d.open_ended)
+        self.index.damage += [self._estimated(d, holes_s) for d in damage]
         self.index.damage.sort(key=lambda damage: -1 if damage.offset is None else damage.offset)
         self.index.segments.sort(key=lambda segment: (segment.start_ns, segment.offset))
         self.index.counts = self.found
@@ -282,12 +283,12 @@ class _Scan:
             last.messages = (last.messages or 0) + (hole.messages or 0) if known else None
         return merged
 
-    def _estimated(self, damage: Damage) -> Damage:
-        """With the number of messages that the rate of all others gives for the seconds lost."""
+    def _estimated(self, damage: Damage, holes_s: float) -> Damage:
+        """With the number of messages that the rate outside of all holes gives for the seconds lost."""
         segments = self.index.segments
         if damage.messages is not None or damage.seconds is None or not segments:
             return damage
-        span_s = (max(s.end_ns for s in segments) - min(s.start_ns for s in segments)) * _NS
+        span_s = (max(s.end_ns for s in segments) - min(s.start_ns for s in segments)) * _NS - holes_s
         if span_s <= 0:
             return damage
         return replace(damage, messages=round(damage.seconds / span_s * sum(self.found.values())), estimated=True)

@@ -78,15 +78,19 @@ class RawMessage:
         topic, msgtype: as in `Topic`.
         log_ns: when the recorder received it.
         data: the serialised bytes, a view that is valid as long as it is held.
+        notes: what the file says about the channel, such as its quality of service.
     """
 
-    __slots__ = ("_decode", "data", "log_ns", "msgtype", "topic")
+    __slots__ = ("_decode", "data", "log_ns", "msgtype", "notes", "topic")
 
-    def __init__(self, topic: Topic, log_ns: int, data: bytes | memoryview, decode: Decoder) -> None:
+    def __init__(
+        self, topic: Topic, log_ns: int, data: bytes | memoryview, decode: Decoder, notes: Mapping[str, str]
+    ) -> None:
         self.topic = topic.name
         self.msgtype = topic.msgtype
         self.log_ns = log_ns
         self.data = data
+        self.notes = notes
         self._decode = decode
 
     @property
