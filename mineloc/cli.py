@@ -5,9 +5,10 @@ Heavy imports live inside the commands: `mineloc --help` must answer at once.
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -28,6 +29,40 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable resul
 @app.callback()
 def _root() -> None:  # pyright: ignore[reportUnusedFunction]  # typer keeps subcommands even if there is only one
     pass
+
+
+@app.command()
+def evaluate(
+    estimate: Annotated[str, typer.Argument(help="Run folder, TUM, KITTI or MCAP file (FILE.mcap:/topic).")],
+    reference: Annotated[
+        str | None, typer.Option("--reference", help="Flight, TUM, KITTI or MCAP file; a run may bring its own.")
+    ] = None,
+    align: Annotated[
+        Literal["none", "origin", "posyaw", "se3"] | None,
+        typer.Option("--align", help="One alignment; without it none, origin and se3 are shown."),
+    ] = None,
+    as_json: JsonOption = False,
+    config: ConfigOption = None,
+    overrides: SetOption = None,
+) -> None:
+    """How far an estimate is from a reference: APE, RPE, REP-k, KITTI, with the coverage."""
+    from mineloc.config import load_config
+    from mineloc.stages.evaluate import evaluate as run
+
+    section = load_config(config, overrides or ()).evaluate
+    evaluation = run(estimate, reference, align=align, config=section)
+    if as_json:
+        sys.stdout.write(json.dumps(evaluation.to_dict(), indent=1, allow_nan=False) + "\n")
+        return
+    from rich.console import Console
+
+    from mineloc.stages.evaluation_table import heading, tables
+
+    console = Console(highlight=False)
+    for line in heading(evaluation):
+        console.print(line, soft_wrap=True, markup=False)
+    for table in tables(evaluation):
+        console.print(table)
 
 
 def main() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from mcap.reader import McapReader, make_reader
@@ -15,6 +15,7 @@ from mineloc import se3
 from mineloc.data import Trajectory
 from mineloc.errors import FormatError, MinelocError
 from mineloc.io.distinct_poses import first_of_each_time
+from mineloc.io.flight_layout import FLIGHT_RECORD
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 _POSE_OF: Mapping[str, Callable[[Any], Any]] = {
@@ -22,8 +23,6 @@ _POSE_OF: Mapping[str, Callable[[Any], Any]] = {
     "geometry_msgs/msg/PoseStamped": lambda message: message.pose,
     "geometry_msgs/msg/PoseWithCovarianceStamped": lambda message: message.pose.pose,
 }
-FLIGHT_METADATA = "mineloc.flight"
-FLIGHT_POSE_TOPIC = "/pose"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,16 +38,32 @@ class PoseTopic:
 def read_pose_topic(path: Path, topic: str | None = None) -> PoseTopic:
     """The poses of one topic of an MCAP, stamped by their headers, in rising order.
 
-    Without `topic`: `/pose` in a flight of ours, else the only topic with poses.
+    Without `topic`: the only topic with poses.
 
     Raises:
         FormatError: no such file, damaged, no such topic, none or several with poses, no header times, a
             pose that is not finite.
     """
+    return _guarded(path, lambda reader: _read(path, reader, topic))
+
+
+def is_flight(path: Path) -> bool:
+    """Whether an MCAP is a canonical flight.
+
+    Raises:
+        FormatError: no such file, or damaged.
+    """
+    return _guarded(path, lambda reader: any(m.name == FLIGHT_RECORD for m in reader.iter_metadata()))
+
+
+T = TypeVar("T")
+
+
+def _guarded(path: Path, work: Callable[[McapReader], T]) -> T:
     try:
         with path.open("rb") as f:
             # one flipped byte otherwise goes unnoticed
-            return _read(path, make_reader(f, validate_crcs=True), topic)
+            return work(make_reader(f, validate_crcs=True))
     except MinelocError:
         raise
     except FileNotFoundError:
@@ -65,7 +80,7 @@ def read_pose_topic(path: Path, topic: str | None = None) -> PoseTopic:
 
 def _read(path: Path, reader: McapReader, topic: str | None) -> PoseTopic:
     kinds = _pose_topics(path, reader)
-    topic = topic if topic is not None else _only_topic(path, reader, kinds)
+    topic = topic if topic is not None else _only_topic(path, kinds)
     if topic not in kinds:
         raise FormatError(path, f"no poses on {topic}", expected=_list(kinds), todo="name one: FILE.mcap:/topic")
     pose_of = _POSE_OF[kinds[topic]]
@@ -108,9 +123,7 @@ def _pose_topics(path: Path, reader: McapReader) -> dict[str, str]:
     return found
 
 
-def _only_topic(path: Path, reader: McapReader, kinds: Mapping[str, str]) -> str:
-    if FLIGHT_POSE_TOPIC in kinds and any(m.name == FLIGHT_METADATA for m in reader.iter_metadata()):
-        return FLIGHT_POSE_TOPIC
+def _only_topic(path: Path, kinds: Mapping[str, str]) -> str:
     if len(kinds) == 1:
         return next(iter(kinds))
     if kinds:

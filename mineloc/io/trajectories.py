@@ -20,7 +20,9 @@ from mineloc import se3
 from mineloc.data import F64, Trajectory
 from mineloc.errors import FormatError
 from mineloc.io.distinct_poses import DistinctPoses, first_of_each_time
-from mineloc.io.pose_topics import read_pose_topic
+from mineloc.io.flight_layout import POSE
+from mineloc.io.flight_reader import FlightReader
+from mineloc.io.pose_topics import is_flight, read_pose_topic
 from mineloc.output import new_file
 
 Kind = Literal["tum", "kitti", "mcap"]
@@ -55,8 +57,10 @@ class LoadedTrajectory:
 def read_trajectory(spec: str | Path) -> Trajectory:
     """The trajectory in a TUM or KITTI file, or in an MCAP (`file.mcap` or `file.mcap:/topic`).
 
+    Of a flight it is the reference, of another recording the only topic with poses, unless a topic is named.
+
     Raises:
-        FormatError: see `load_trajectory`.
+        MinelocError: see `load_trajectory`.
     """
     return load_trajectory(spec).trajectory
 
@@ -66,11 +70,14 @@ def load_trajectory(spec: str | Path) -> LoadedTrajectory:
 
     Raises:
         FormatError: no such file, none of the formats, an unreadable line (told by its number), time going backwards,
-            several or no pose topics in a recording.
+            several or no pose topics in a recording, a flight without reference.
+        IngestError, FlightError: a damaged flight.
     """
     path, topic = _split_topic(str(spec))
     if path.is_dir():
         raise FormatError(path, "is a folder", expected="a trajectory file", todo="name the file in it")
+    if topic is None and path.suffix == ".mcap" and is_flight(path):
+        return _load_reference(path)
     if topic is not None or path.suffix == ".mcap":
         found = read_pose_topic(path, topic)
         return LoadedTrajectory(found.trajectory, f"{path}:{found.topic}", "mcap", found.duplicates, found.conflicts)
@@ -139,6 +146,16 @@ def write_kitti(path: Path, trajectory: Trajectory, *, overwrite: bool = False) 
     with new_file(path, overwrite=overwrite) as temp, temp.open("w", encoding="ascii", newline="\n") as f:
         for row in trajectory.poses[:, :3, :].reshape(-1, 12).tolist():
             f.write(" ".join(f"{value:.12e}" for value in row) + "\n")
+
+
+def _load_reference(path: Path) -> LoadedTrajectory:
+    with FlightReader(path) as flight:
+        reference = flight.reference()
+    if reference is None or not len(reference):
+        raise FormatError(
+            path, "the flight has no reference", expected="poses on /pose", todo="name another topic: FILE.mcap:/topic"
+        )
+    return LoadedTrajectory(reference, f"{path}:{POSE}", "mcap")
 
 
 def _split_topic(spec: str) -> tuple[Path, str | None]:

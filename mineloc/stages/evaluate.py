@@ -1,0 +1,153 @@
+"""The evaluate stage: a run or a trajectory file against a reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mineloc.config import EvaluateConfig
+from mineloc.data import Trajectory
+from mineloc.errors import EvaluationError
+from mineloc.io.trajectories import LoadedTrajectory, load_trajectory
+from mineloc.metrics.alignment import Alignment
+from mineloc.metrics.association import Pairs
+from mineloc.stages.run_folder import RunFolder
+from mineloc.stages.scores import Scores, pair, score
+
+SCHEMA = "mineloc.evaluation/1"
+ALIGNMENTS: tuple[Alignment, ...] = ("none", "origin", "se3")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evaluation:
+    """How far an estimate is from a reference.
+
+    Attributes:
+        estimate, reference: where they came from.
+        scores: one entry a trajectory; a run has `smoothed` and `online`.
+        trusted_share: share of the run's sweeps whose pose rests on more than the motion prior; None for a file.
+        notes: what was left out while reading.
+    """
+
+    estimate: str
+    reference: str
+    scores: tuple[Scores, ...]
+    trusted_share: float | None = None
+    notes: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON, without the arrays along the flight."""
+        return {
+            "schema": SCHEMA,
+            "estimate": self.estimate,
+            "reference": self.reference,
+            "trusted_share": self.trusted_share,
+            "notes": list(self.notes),
+            "trajectories": [one.to_dict() for one in self.scores],
+        }
+
+
+def evaluate(
+    estimate: str | Path,
+    reference: str | Path | None = None,
+    *,
+    align: Alignment | None = None,
+    config: EvaluateConfig | None = None,
+) -> Evaluation:
+    """Score an estimate.
+
+    Args:
+        estimate: a run folder (both its trajectories are scored), or a TUM, KITTI or MCAP file; `file.mcap:/topic`
+            names a topic.
+        reference: a flight, or a file as above. None takes the reference that a run brings along.
+        align: one alignment; None scores `none`, `origin` and `se3`.
+        config: association, distances, gaps.
+
+    Raises:
+        EvaluationError: no times or poses in common, too few poses, an alignment that the poses leave open, no
+            reference.
+        FormatError: a file cannot be read; NaN is told with its line.
+    """
+    config = config if config is not None else EvaluateConfig()
+    trajectories, own_reference, trusted_share, notes = _estimates(estimate)
+    truth = _reference(estimate, reference, own_reference)
+    scores: list[Scores] = []
+    for name, trajectory in trajectories.items():
+        pairs = _pairs(str(estimate), trajectory, truth, config)
+        one = score(name, truth.trajectory, trajectory, pairs, (align,) if align else ALIGNMENTS, config)
+        if not one.aligned:
+            raise EvaluationError(estimate, one.notes[0], todo="choose --align origin or none")
+        scores.append(one)
+    return Evaluation(
+        estimate=str(estimate),
+        reference=truth.source,
+        scores=tuple(scores),
+        trusted_share=trusted_share,
+        notes=(*notes, *_left_out(truth)),
+    )
+
+
+def _estimates(
+    estimate: str | Path,
+) -> tuple[dict[str, Trajectory], LoadedTrajectory | None, float | None, tuple[str, ...]]:
+    folder = Path(estimate)
+    if not folder.is_dir():
+        loaded = load_trajectory(estimate)
+        return {"estimate": loaded.trajectory}, None, None, _left_out(loaded)
+    run = RunFolder.open(folder)
+    own = None
+    if run.reference is not None:
+        own = LoadedTrajectory(run.reference, str(folder / "reference.tum"), "tum")
+    trusted = run.sweeps["trusted"].to_numpy()
+    share = float(trusted.mean()) if len(trusted) else None
+    return {"smoothed": run.smoothed, "online": run.online}, own, share, ()
+
+
+def _reference(
+    estimate: str | Path, reference: str | Path | None, own_reference: LoadedTrajectory | None
+) -> LoadedTrajectory:
+    if reference is not None:
+        return load_trajectory(reference)
+    if own_reference is None:
+        raise EvaluationError(
+            estimate, "brings no reference along", expected="something to compare with", todo="give --reference"
+        )
+    return own_reference
+
+
+def _left_out(loaded: LoadedTrajectory) -> tuple[str, ...]:
+    if not loaded.duplicates and not loaded.conflicts:
+        return ()
+    return (
+        f"{loaded.source}: left out {loaded.duplicates} repeated poses and "
+        f"{loaded.conflicts} others for a time that had one",
+    )
+
+
+def _pairs(where: str, trajectory: Trajectory, truth: LoadedTrajectory, config: EvaluateConfig) -> Pairs:
+    for source, one in ((where, trajectory), (truth.source, truth.trajectory)):
+        if len(one) < 2:
+            raise EvaluationError(
+                source, f"{len(one)} pose{'s' * (len(one) != 1)}", expected="a trajectory of 2 poses or more"
+            )
+    try:
+        pairs = pair(truth.trajectory, trajectory, config)
+    except ValueError as error:
+        raise EvaluationError(
+            where, f"cannot be compared with {truth.source}: {error}", expected="both with times, or as many poses"
+        ) from None
+    if len(pairs) < 2:
+        raise EvaluationError(
+            where,
+            f"{len(pairs)} of {len(trajectory)} poses have one near in time in {truth.source} "
+            f"({_span(trajectory)} against {_span(truth.trajectory)})",
+            expected=f"the same clock, within {config.max_time_difference_s} s",
+            todo="check the times, or raise evaluate.max_time_difference_s",
+        )
+    return pairs
+
+
+def _span(trajectory: Trajectory) -> str:
+    first, last = trajectory.stamps_ns[[0, -1]] * 1e-9
+    return f"{first:.3f} … {last:.3f} s"
