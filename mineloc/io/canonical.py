@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mineloc import se3
 from mineloc.data import Calibration, ImuSamples, Sweep, Trajectory
-from mineloc.io.cdr_layout import CdrLayout, Part, Text, fixed_layout, rows
+from mineloc.io.cdr_layout import CdrLayout, Part, Text, fixed_layout, rows, stamps_ns
 from mineloc.io.ros import POINT_CLOUD2, STORE, TF_MESSAGE, stamp_parts
 
 I64 = NDArray[np.int64]
@@ -162,14 +162,10 @@ def transform_layout(frame: str, child: str) -> CdrLayout:
     )
 
 
-def _stamped(layout: CdrLayout, stamps_ns: I64) -> NDArray[np.void]:
-    records = layout.new(len(stamps_ns))
-    records["sec"], records["nanosec"] = np.divmod(stamps_ns, 1_000_000_000)
+def _stamped(layout: CdrLayout, stamps: I64) -> NDArray[np.void]:
+    records = layout.new(len(stamps))
+    records["sec"], records["nanosec"] = np.divmod(stamps, 1_000_000_000)
     return records
-
-
-def _stamps(records: NDArray[np.void]) -> I64:
-    return records["sec"].astype(np.int64) * 1_000_000_000 + records["nanosec"].astype(np.int64)
 
 
 def encode_imu(imu: ImuSamples) -> U8:
@@ -189,7 +185,7 @@ def decode_imu(messages: Sequence[bytes | memoryview], frame: str = "imu") -> Im
         ValueError: a message of another layout, or times that do not increase.
     """
     records = imu_layout(frame).view(b"".join(messages))
-    return ImuSamples(_stamps(records), records["gyro_radps"].copy(), records["accel_mps2"].copy())
+    return ImuSamples(stamps_ns(records), records["gyro_radps"].copy(), records["accel_mps2"].copy())
 
 
 def encode_poses(trajectory: Trajectory, layout: CdrLayout) -> U8:
@@ -209,7 +205,7 @@ def decode_poses(messages: Sequence[bytes | memoryview], layout: CdrLayout, *, p
     """
     records = layout.view(b"".join(messages))
     poses = se3.from_xyzw(records["position_m"], records["orientation_xyzw"])
-    return Trajectory(_stamps(records), poses, parent, child)
+    return Trajectory(stamps_ns(records), poses, parent, child)
 
 
 def encode_calibration(calibration: Calibration, stamp_ns: int) -> bytes | memoryview:

@@ -92,3 +92,8 @@ def fixed_layout(parts: Sequence[Part]) -> CdrLayout:
 def rows(records: Records) -> NDArray[np.uint8]:
     """(n, itemsize) bytes of the records; a row is one message."""
     return np.ascontiguousarray(records).view(np.uint8).reshape(len(records), records.dtype.itemsize)
+
+
+def stamps_ns(records: Records) -> NDArray[np.int64]:
+    """(n,) `header.stamp` of records with the fields `sec` and `nanosec`."""
+    return records["sec"].astype(np.int64) * 1_000_000_000 + records["nanosec"].astype(np.int64)

@@ -19,7 +19,7 @@ Quaternion = Annotated[tuple[float, ...], Field(min_length=4, max_length=4)]
 
 
 class Topics(Section):
-    """Names of the topics; empty means: the only one of its type."""
+    """Names of the topics; empty means: the only one of its type, `none`: leave it out."""
 
     lidar: str = ""
     imu: str = ""
