@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing, suppress
 from queue import Empty, Full, Queue
 from typing import Generic, TypeVar, cast
 
@@ -17,7 +18,7 @@ T = TypeVar("T")
 _POLL_S = 0.05
 
 
-def prefetched(items: Iterable[T], *, depth: int) -> Generator[T]:
+def prefetched(items: Generator[T], *, depth: int) -> Generator[T]:
     """The same items in the same order, produced up to `depth` ahead by a background thread.
 
     An exception of the producer is raised at its place in the order. Closing the generator early stops the thread.
@@ -35,10 +36,11 @@ def prefetched(items: Iterable[T], *, depth: int) -> Generator[T]:
 
     def produce() -> None:
         try:
-            for item in items:
-                put((False, item))
-                if stop.is_set():
-                    return
+            with closing(items):
+                for item in items:
+                    put((False, item))
+                    if stop.is_set():
+                        return
             put((True, None))
         except BaseException as error:  # noqa: BLE001 - handed to the consumer, which raises it
             put((True, error))
@@ -61,11 +63,9 @@ def prefetched(items: Iterable[T], *, depth: int) -> Generator[T]:
 
 
 def _drain(ahead: Queue[tuple[bool, object]]) -> None:
-    try:
+    with suppress(Empty):
         while True:
             ahead.get_nowait()
-    except Empty:
-        pass
 
 
 class OrderedPipeline(Generic[T]):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Generator, Iterable
+from collections.abc import Generator
 from pathlib import Path
 from types import TracebackType
 from typing import cast
@@ -17,11 +17,14 @@ from mineloc.errors import FlightError, IngestError
 from mineloc.io import canonical
 from mineloc.io import flight_layout as layout
 from mineloc.io.background import prefetched
+from mineloc.io.cdr_layout import CdrLayout
 from mineloc.io.mcap_chunks import RawRecord, ordered_messages, read_attachment, read_summary
-from mineloc.io.ros import POINT_CLOUD2
+from mineloc.io.ros import IMU, ODOMETRY, POINT_CLOUD2, POSE_STAMPED
 
 # Decoded this far ahead of the consumer: a few megabytes.
 _AHEAD = 4
+# Small messages decoded at a time.
+_PORTION = 2000
 # A sweep waits this long for inertial samples that do not come.
 _PATIENCE_NS = 300_000_000
 
@@ -118,7 +121,14 @@ class FlightReader:
             FlightError: their times do not increase.
             IngestError: a damaged chunk, or samples in a layout that mineloc does not write.
         """
-        return self._decode_imu([cast("RawRecord", item) for item in self._items(layout.IMU_TOPIC)])
+        parts = [self._decode_imu(records) for records in self._portions(layout.IMU_TOPIC)]
+        if not parts:
+            return ImuSamples.empty()
+        return ImuSamples(
+            np.concatenate([part.stamps_ns for part in parts]),
+            np.concatenate([part.gyro_radps for part in parts]),
+            np.concatenate([part.accel_mps2 for part in parts]),
+        )
 
     def reference(self) -> Trajectory | None:
         """The reference `T_map_body`, None when the flight has none.
@@ -127,42 +137,45 @@ class FlightReader:
             FlightError: its times do not increase.
             IngestError: a damaged chunk, or poses in a layout that mineloc does not write.
         """
-        return self._poses(layout.POSE, canonical.pose_layout(layout.MAP), layout.MAP)
+        return self._poses(layout.POSE, canonical.pose_layout(layout.MAP), POSE_STAMPED, layout.MAP)
 
     def odometry(self) -> Trajectory | None:
         """The odometry that came with the recording, `T_odom_body`; None when there was none."""
         made = canonical.odometry_layout(layout.ODOM_FRAME, layout.BODY)
-        return self._poses(layout.ODOM, made, layout.ODOM_FRAME)
+        return self._poses(layout.ODOM, made, ODOMETRY, layout.ODOM_FRAME)
 
     def steps(self) -> Generator[tuple[Sweep, ImuSamples]]:
-        """Every sweep with its inertial samples, in one pass.
+        """Every sweep with its inertial samples, in one pass, read ahead by a background thread.
 
-        A sample is given once: with the first sweep that ends at or after it, or, when it is the first one at or past
-        that sweep's end, with that sweep too early rather than too late. So the samples of a step reach at least up
-        to `sweep.end_ns` wherever the flight has samples within 0.3 s of it.
+        Each sample is given once, with the first sweep that needs it: the samples of a step are those after the ones
+        of the step before, up to the first at or after `sweep.end_ns`. They end earlier only where the flight has no
+        sample within 0.3 s after that.
 
         Raises:
             FlightError: time goes backwards or repeats.
             IngestError: a damaged chunk.
         """
+        return prefetched(self._steps(), depth=_AHEAD)
+
+    def _steps(self) -> Generator[tuple[Sweep, ImuSamples]]:
         held: deque[Sweep] = deque()
         samples: list[RawRecord] = []
-        for item in prefetched(self._items(layout.POINTS, layout.IMU_TOPIC), depth=4 * _AHEAD):
-            now_ns = item.end_ns if isinstance(item, Sweep) else item.log_ns
+        for item in self._items(layout.POINTS, layout.IMU_TOPIC):
+            if isinstance(item, Sweep):
+                now_ns = item.end_ns
+                held.append(item)
+            else:
+                now_ns = item.log_ns
             while held and now_ns > held[0].end_ns + _PATIENCE_NS:
                 yield held.popleft(), self._decode_imu(samples)
                 samples = []
-            if isinstance(item, Sweep):
-                held.append(item)
-                if not (samples and samples[-1].log_ns >= item.end_ns):
-                    continue
-            else:
+            if isinstance(item, RawRecord):
                 samples.append(item)
             while held and samples and samples[-1].log_ns >= held[0].end_ns:
                 yield held.popleft(), self._decode_imu(samples)
                 samples = []
-        while held:
-            yield held.popleft(), self._decode_imu(samples)
+        for sweep in held:
+            yield sweep, self._decode_imu(samples)
             samples = []
 
     def attachment(self, name: str) -> bytes:
@@ -194,19 +207,29 @@ class FlightReader:
             if not channels.keys().isdisjoint(index.message_index_offsets)
             and (start_ns is None or index.message_end_time >= start_ns)
         ]
-        last_ns: int | None = None
+        last_ns: dict[str, int] = {}
         for record in ordered_messages(self.path, chunks, channels):
             channel = channels[record.channel]
-            if channel.topic != layout.POINTS:
-                yield record
-                continue
-            sweep = self._decode_sweep(record, channel)
-            if last_ns is not None and sweep.stamp_ns <= last_ns:
-                raise self._disorder(layout.POINTS, last_ns, sweep.stamp_ns)
-            last_ns = sweep.stamp_ns
-            yield sweep
-            if end_ns is not None and sweep.stamp_ns >= end_ns:
+            item = self._decode_sweep(record, channel) if channel.topic == layout.POINTS else record
+            now_ns = item.stamp_ns if isinstance(item, Sweep) else item.log_ns
+            before_ns = last_ns.get(channel.topic)
+            if before_ns is not None and now_ns <= before_ns:
+                raise self._disorder(channel.topic, before_ns, now_ns)
+            last_ns[channel.topic] = now_ns
+            yield item
+            if end_ns is not None and now_ns >= end_ns:
                 return
+
+    def _portions(self, topic: str) -> Generator[list[RawRecord]]:
+        """The messages of a topic, so many at a time that their chunks can be forgotten soon."""
+        portion: list[RawRecord] = []
+        for item in self._items(topic):
+            portion.append(cast("RawRecord", item))
+            if len(portion) >= _PORTION:
+                yield portion
+                portion = []
+        if portion:
+            yield portion
 
     def _decode_sweep(self, record: RawRecord, channel: Channel) -> Sweep:
         try:
@@ -218,27 +241,23 @@ class FlightReader:
     def _decode_imu(self, records: list[RawRecord]) -> ImuSamples:
         if not records:
             return ImuSamples.empty()
-        self._need_order(layout.IMU_TOPIC, records)
         try:
             return canonical.decode_imu([r.data for r in records])
         except ValueError as error:
-            raise self._foreign(layout.IMU_TOPIC, "Imu") from error
+            raise self._foreign(layout.IMU_TOPIC, IMU) from error
 
-    def _poses(self, topic: str, made: canonical.CdrLayout, parent: str) -> Trajectory | None:
-        records = [cast("RawRecord", item) for item in self._items(topic)]
-        if not records:
+    def _poses(self, topic: str, made: CdrLayout, msgtype: str, parent: str) -> Trajectory | None:
+        parts: list[Trajectory] = []
+        for records in self._portions(topic):
+            try:
+                data = [r.data for r in records]
+                parts.append(canonical.decode_poses(data, made, parent=parent, child=layout.BODY))
+            except ValueError as error:
+                raise self._foreign(topic, msgtype) from error
+        if not parts:
             return None
-        self._need_order(topic, records)
-        try:
-            return canonical.decode_poses([r.data for r in records], made, parent=parent, child=layout.BODY)
-        except ValueError as error:
-            raise self._foreign(topic, "pose") from error
-
-    def _need_order(self, topic: str, records: Iterable[RawRecord]) -> None:
-        logged = np.array([record.log_ns for record in records])
-        bad = np.flatnonzero(np.diff(logged) <= 0)
-        if len(bad):
-            raise self._disorder(topic, int(logged[bad[0]]), int(logged[bad[0] + 1]))
+        stamps = np.concatenate([part.stamps_ns for part in parts])
+        return Trajectory(stamps, np.concatenate([part.poses for part in parts]), parent, layout.BODY)
 
     def _disorder(self, topic: str, before_ns: int, now_ns: int) -> FlightError:
         what = "repeats" if now_ns == before_ns else "goes backwards"
@@ -252,7 +271,7 @@ class FlightReader:
     def _foreign(self, topic: str, what: str) -> IngestError:
         return IngestError(
             self.path,
-            f"{topic} holds a {what} message that mineloc did not write",
+            f"{topic} holds a {what} that mineloc did not write",
             expected="a canonical flight",
             todo="run mineloc ingest first",
         )

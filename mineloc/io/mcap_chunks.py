@@ -20,13 +20,16 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Attachment, AttachmentIndex, Chunk, ChunkIndex
+from mcap.records import Attachment, AttachmentIndex, ChunkIndex
 from mcap.summary import Summary
 
 from mineloc.errors import IngestError
 
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
+# uncompressed size, its CRC, length of the compression's name; after opcode, length and two times
+_CHUNK = struct.Struct("<QII")
+_CHUNK_SIZE_AT = 1 + 8 + 8 + 8
 _FOOTER_BYTES = 1 + 8 + 8 + 8 + 4 + 8
 # A canonical chunk is 1 MiB or one sweep; more than this is a damaged or hostile size.
 _MAX_CHUNK_BYTES = 1 << 28
@@ -119,34 +122,37 @@ def _read_chunk(path: Path, stream: BinaryIO, index: ChunkIndex) -> list[RawReco
         raw = stream.read(index.chunk_length)
         if len(raw) != index.chunk_length or raw[0] != Opcode.CHUNK:
             raise IngestError(path, f"{where} is missing", todo="run mineloc ingest to recover the rest")
-        chunk = Chunk.read(ReadDataStream(BytesIO(memoryview(raw)[9:])))
-        data = _unpack(chunk)
-        if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        size, crc, name_length = _CHUNK.unpack_from(raw, _CHUNK_SIZE_AT)
+        name_at = _CHUNK_SIZE_AT + _CHUNK.size
+        data_at = name_at + name_length + 8
+        data = _unpack(memoryview(raw)[data_at:], raw[name_at : data_at - 8].decode(), size)
+        if crc not in (0, zlib.crc32(data)):
             raise IngestError(path, f"{where} is damaged (checksum)", todo="run mineloc ingest to recover the rest")
         return _messages(data, index.chunk_start_offset)
     except IngestError:
         raise
     except Exception as error:
+        # see read_summary
         raise _damaged(path, f"{where} is damaged", error) from error
 
 
-def _unpack(chunk: Chunk) -> bytes:
-    if chunk.uncompressed_size > _MAX_CHUNK_BYTES:
-        raise ValueError(f"claims {chunk.uncompressed_size} bytes")
-    if chunk.compression == "lz4":
-        data = bytes(lz4.frame.decompress(chunk.data))
-    elif chunk.compression == "zstd":
-        data = zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=chunk.uncompressed_size)
-    elif chunk.compression == "":
-        data = chunk.data
+def _unpack(packed: memoryview, compression: str, size: int) -> bytes | memoryview:
+    if size > _MAX_CHUNK_BYTES:
+        raise ValueError(f"claims {size} bytes")
+    if compression == "lz4":
+        data = lz4.frame.decompress(packed)
+    elif compression == "zstd":
+        data = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
+    elif compression == "":
+        data = packed
     else:
-        raise ValueError(f"compression {chunk.compression!r}")
-    if len(data) != chunk.uncompressed_size:
-        raise ValueError(f"{len(data)} bytes instead of {chunk.uncompressed_size}")
+        raise ValueError(f"compression {compression!r}")
+    if len(data) != size:
+        raise ValueError(f"{len(data)} bytes instead of {size}")
     return data
 
 
-def _messages(data: bytes, chunk_offset: int) -> list[RawRecord]:
+def _messages(data: bytes | memoryview, chunk_offset: int) -> list[RawRecord]:
     out: list[RawRecord] = []
     view, at = memoryview(data), 0
     while at < len(data):
