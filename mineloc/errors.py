@@ -74,3 +74,7 @@ class SimulationError(MinelocError):
 
 class EvaluationError(MinelocError):
     """Estimate and reference cannot be compared (no overlap in time, too few poses)."""
+
+
+class SurveyError(MinelocError):
+    """A survey stopped: a stage's process died, the server does not answer, the program failed."""

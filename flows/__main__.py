@@ -1,0 +1,78 @@
+"""The process in which a survey's flow runs, started by `mineloc run`: `python -m flows SURVEY.toml --out FOLDER`."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import signal
+import sys
+import threading
+import traceback
+from pathlib import Path
+
+from flows.server import own_server
+from flows.settings import answering, settings
+from mineloc.errors import MinelocError, SurveyError
+from mineloc.survey.flow_process import error_to_line
+
+
+def main() -> int:
+    """Run the flow of a survey; the error of one that failed goes to the events, its story to stderr."""
+    parser = argparse.ArgumentParser(prog="flows")
+    parser.add_argument("survey", type=Path)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--set", action="append", default=[], dest="overrides")
+    parser.add_argument("--server")
+    parser.add_argument("--events", type=int, help="file descriptor that takes events as lines of JSON")
+    given = parser.parse_args()
+    if given.events is not None:
+        threading.Thread(target=_end_with_parent, daemon=True).start()
+    try:
+        _run(given)
+    except MinelocError as error:
+        return _fail(given.events, error)
+    except KeyboardInterrupt:
+        return 130
+    except Exception as error:  # noqa: BLE001  # the user gets one line, the log the rest
+        return _fail(given.events, SurveyError("flow", f"the program failed ({error!r})", todo="see its log"))
+    return 0
+
+
+def _run(given: argparse.Namespace) -> None:
+    home = given.out / ".mineloc" / "prefect"
+    os.environ.update(settings(None if given.server else home))
+    if given.server:
+        os.environ["PREFECT_API_URL"] = answering(given.server)
+        _flow(given)
+        return
+    with own_server(home) as ready:
+        os.environ["PREFECT_API_URL"] = ready.address
+        importlib.import_module("flows.survey")  # takes seconds, as the server does: both at once
+        ready.wait()
+        _flow(given)
+
+
+def _flow(given: argparse.Namespace) -> None:
+    from flows.survey import survey
+
+    survey(str(given.survey), out=str(given.out), overrides=given.overrides, events=given.events)
+
+
+def _fail(events: int | None, error: MinelocError) -> int:
+    traceback.print_exc()
+    if events is None:
+        sys.stderr.write(f"{error}\n")
+    else:
+        os.write(events, error_to_line(error).encode())
+    return 1
+
+
+def _end_with_parent() -> None:
+    """The parent holds the other end of stdin; when it is gone, so is the reason for this process group to be."""
+    sys.stdin.buffer.read()
+    os.killpg(0, signal.SIGKILL)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,65 @@
+"""A Prefect server for one run, or the address of one that runs already."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from flows.settings import START_S, answers
+from mineloc.errors import SurveyError
+
+STOP_S = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Starting:
+    """A server that was just started."""
+
+    address: str
+    process: subprocess.Popen[bytes]
+
+    def wait(self) -> None:
+        """Until it answers.
+
+        Raises:
+            SurveyError: it ended, or it takes too long.
+        """
+        deadline = time.monotonic() + START_S
+        while not answers(self.address):
+            if self.process.poll() is not None or time.monotonic() > deadline:
+                raise SurveyError("prefect server", "did not start", todo="see server.log, or run with --local")
+            time.sleep(0.1)
+
+
+@contextmanager
+def own_server(home: Path) -> Generator[Starting]:
+    """A server on a free port of this machine alone, with its history in `home`; ends with the block."""
+    home.mkdir(parents=True, exist_ok=True)
+    with socket.socket() as free, (home / "server.log").open("wb") as log:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+        free.close()
+        address = f"http://127.0.0.1:{port}/api"
+        process = subprocess.Popen(
+            [sys.executable, "-m", "prefect", "server", "start", "--host", "127.0.0.1", "--port", str(port)],
+            env=os.environ | {"PREFECT_API_URL": address, "PREFECT_UI_API_URL": address},
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+        )
+    try:
+        yield Starting(address, process)
+    finally:
+        process.terminate()
+        try:
+            process.wait(STOP_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()

@@ -1,0 +1,191 @@
+"""From a survey to its steps: which stage runs on which input, and where its result is put.
+
+simulate? -> ingest -> localize (a method) -> evaluate, record
+                                           -> report (all runs)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeAlias
+
+from mineloc.config import Config
+from mineloc.stages.stage import Input, Job, Stage
+from mineloc.store.digest import Json
+from mineloc.store.store import Outcome, Store
+from mineloc.survey.registry import EVALUATE, INGEST, LOCALIZE, RECORD, REPORT, SIMULATE
+from mineloc.survey.spec import Flight, Survey
+
+METRICS = "metrics.json"
+RECORDING = "run.rrd"
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """The result of another step, as an input."""
+
+    step: str
+
+
+Wanted: TypeAlias = Path | Made
+
+
+@dataclass(frozen=True)
+class Step:
+    """One stage of one flight (or of the whole survey).
+
+    Attributes:
+        name: unique in the plan, `flight stage` or `flight stage method`.
+        flight: its flight, empty for the survey's own.
+        to: where the result goes, relative to the survey's folder.
+        beside: files in `to` that other steps put there.
+    """
+
+    name: str
+    flight: str
+    stage: Stage
+    to: str
+    inputs: Mapping[str, Wanted | tuple[Wanted, ...]]
+    config: Config
+    arguments: Mapping[str, Json] = field(default_factory=dict)
+    beside: tuple[str, ...] = ()
+
+    def needs(self) -> list[str]:
+        """The names of the steps whose results this one reads."""
+        return [one.step for given in self.inputs.values() for one in _group(given) if isinstance(one, Made)]
+
+    def job(self, plan: Plan, store: Store, made: Mapping[str, Outcome]) -> Job:
+        """The step on the content of its inputs, of which those outside the store are hashed now.
+
+        Raises:
+            StoreError: a source cannot be read.
+        """
+
+        def known(one: Wanted) -> Input:
+            if isinstance(one, Made):
+                return Input(plan.place_of(one.step), made[one.step].output, is_source=False)
+            return Input(one, store.source(one), is_source=True)
+
+        return Job(
+            stage=self.stage,
+            out_name=Path(self.to).name,
+            inputs={
+                name: tuple(known(one) for one in given) if isinstance(given, tuple) else known(given)
+                for name, given in self.inputs.items()
+            },
+            arguments=self.arguments,
+            config=self.config,
+        )
+
+
+@dataclass(frozen=True)
+class Run:
+    """Where a run of a method on a flight ends up."""
+
+    flight: str
+    method: str
+    folder: Path
+
+    @property
+    def metrics(self) -> Path:
+        """The evaluation, as JSON."""
+        return self.folder / METRICS
+
+    @property
+    def recording(self) -> Path:
+        """The Rerun recording."""
+        return self.folder / RECORDING
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All steps, each after those whose results it reads.
+
+    Attributes:
+        out: the survey's folder.
+        workers: how many steps run at the same time.
+    """
+
+    out: Path
+    workers: int
+    steps: tuple[Step, ...]
+    runs: tuple[Run, ...]
+
+    def step(self, name: str) -> Step:
+        """A step by name."""
+        return next(step for step in self.steps if step.name == name)
+
+    def place_of(self, name: str) -> Path:
+        """Where the result of a step goes."""
+        return self.out / self.step(name).to
+
+    @property
+    def state(self) -> Path:
+        """Where store, logs and the flows' history live."""
+        return self.out / ".mineloc"
+
+    @property
+    def report(self) -> Path:
+        """The HTML report."""
+        return self.out / "report.html"
+
+
+def plan_survey(survey: Survey) -> Plan:
+    """All steps of a survey, flight after flight, the report last."""
+    steps: list[Step] = []
+    runs: list[Run] = []
+    for flight in survey.flights:
+        steps.extend(_flight_steps(flight))
+        for method in survey.methods:
+            to = f"runs/{flight.name}-{method}"
+            steps.extend(_run_steps(flight, method, to))
+            runs.append(Run(flight.name, method, survey.out / to))
+    localized = tuple(Made(step.name) for step in steps if step.stage is LOCALIZE)
+    title: dict[str, Json] = {"title": survey.title} if survey.title else {}
+    steps.append(Step("report", "", REPORT, "report.html", {"runs": localized}, config=survey.config, arguments=title))
+    return Plan(survey.out, survey.workers, tuple(steps), tuple(runs))
+
+
+def _flight_steps(flight: Flight) -> Iterator[Step]:
+    source: Wanted
+    if flight.recording is not None:
+        source = flight.recording
+    else:
+        name = f"{flight.name} simulate"
+        given = {"mine": flight.mine} if isinstance(flight.mine, Path) else {}
+        arguments: dict[str, Json] = {"mine": flight.mine} if isinstance(flight.mine, str) else {}
+        yield Step(
+            name, flight.name, SIMULATE, f"recordings/{flight.name}.mcap", given, flight.config, arguments=arguments
+        )
+        source = Made(name)
+    inputs: dict[str, Wanted] = {"recording": source}
+    if flight.sequence is not None:
+        inputs["sequence"] = flight.sequence
+    yield Step(f"{flight.name} ingest", flight.name, INGEST, f"flights/{flight.name}.mcap", inputs, flight.config)
+
+
+def _run_steps(flight: Flight, method: str, to: str) -> Iterator[Step]:
+    localize = f"{flight.name} localize {method}"
+    yield Step(
+        localize,
+        flight.name,
+        LOCALIZE,
+        to,
+        {"flight": Made(f"{flight.name} ingest")},
+        flight.config,
+        arguments={"method": method},
+        beside=(METRICS, RECORDING),
+    )
+    run: dict[str, Wanted] = {"run": Made(localize)}
+    reference = {"reference": flight.reference} if flight.reference is not None else {}
+    yield Step(
+        f"{flight.name} evaluate {method}", flight.name, EVALUATE, f"{to}/{METRICS}", run | reference, flight.config
+    )
+    seen = run | {"flight": Made(f"{flight.name} ingest")}
+    yield Step(f"{flight.name} record {method}", flight.name, RECORD, f"{to}/{RECORDING}", seen, flight.config)
+
+
+def _group(given: Wanted | tuple[Wanted, ...]) -> tuple[Wanted, ...]:
+    return given if isinstance(given, tuple) else (given,)

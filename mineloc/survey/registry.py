@@ -1,0 +1,18 @@
+"""The stages of a survey. Named, not imported: planning and finding known results load nothing heavy."""
+
+from __future__ import annotations
+
+from mineloc.stages.stage import Stage
+
+SIMULATE = Stage("simulate", 1, "mineloc.stages.simulate:simulate", ("simulate",))
+INGEST = Stage("ingest", 1, "mineloc.stages.ingest:ingest", ("ingest",))
+LOCALIZE = Stage(
+    "localize",
+    1,
+    "mineloc.stages.localize:localize",
+    ("sweep", "keyframe", "odometry", "loam", "graph"),
+    volatile=frozenset({"timing.json"}),
+)
+EVALUATE = Stage("evaluate", 1, "mineloc.survey.score:score", ("evaluate",))
+RECORD = Stage("record", 1, "mineloc.view.run:record_run", ("evaluate", "view"))
+REPORT = Stage("report", 1, "mineloc.report.report:report", ("evaluate", "report"))

@@ -1,0 +1,168 @@
+"""`survey.toml`: which flights, what is done with them, where the results go.
+
+title = "Level 4, October"          # all keys but the flights have defaults
+out = "results"                     # beside the survey file
+methods = ["odometry", "loam"]
+
+[config.odometry]                   # any configuration section, for all flights
+use_imu = true
+
+[[flight]]
+name = "north"
+recording = "bags/north.mcap"       # a recording ...
+reference = "truth/north.tum"       # ... with a reference of its own, if the flight carries none
+
+[[flight]]
+name = "rehearsal"
+mine = "demo"                       # ... or a mine to fly through: built-in name, mesh or plan
+[flight.config.simulate]            # configuration of this flight alone
+length_m = 500
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from mineloc.config import Config, Section, layered_config, read_toml, validate
+from mineloc.errors import ConfigError
+
+NAME = r"[A-Za-z0-9][A-Za-z0-9._-]*"
+
+
+class FlightSpec(Section):
+    """One flight of a survey; paths as written in the file."""
+
+    name: str = Field(pattern=rf"^{NAME}$", max_length=100)
+    recording: str | None = None
+    sequence: str | None = None
+    mine: str | None = None
+    reference: str | None = None
+    config: dict[str, Any] = Field(default_factory=dict)
+
+
+class SurveySpec(Section):
+    """The file as it is written."""
+
+    title: str = ""
+    out: str | None = None
+    methods: tuple[str, ...] = Field(default=("odometry",), min_length=1)
+    workers: int = Field(default=2, ge=1, le=64, description="processes at work at the same time")
+    config: dict[str, Any] = Field(default_factory=dict)
+    flight: tuple[FlightSpec, ...] = Field(min_length=1)
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """One flight, ready to be planned: either `recording` or `mine` is set.
+
+    Attributes:
+        mine: a file, or the name of a built-in mine.
+    """
+
+    name: str
+    recording: Path | None
+    sequence: Path | None
+    mine: Path | str | None
+    reference: Path | None
+    config: Config
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """A survey whose files exist and whose configuration is valid.
+
+    Attributes:
+        path: the survey file.
+        out: the folder for the results.
+        config: what holds for the survey as a whole (the report).
+    """
+
+    path: Path
+    title: str
+    out: Path
+    methods: tuple[str, ...]
+    workers: int
+    flights: tuple[Flight, ...]
+    config: Config
+
+
+def read_survey(path: Path, overrides: Iterable[str] = (), *, out: Path | None = None) -> Survey:
+    """Read a survey file.
+
+    Args:
+        overrides: `section.key=value`, over the configuration of every flight.
+        out: where the results go, over the file's own word.
+
+    Raises:
+        ConfigError: not TOML, an unknown key, a value that does not fit, a file that does not exist, two flights of
+            one name.
+    """
+    spec = validate(SurveySpec, read_toml(path), where=str(path))
+    overrides = list(overrides)
+    _refuse_equal_names(path, [flight.name for flight in spec.flight])
+    flights = tuple(_flight(path, flight, spec.config, overrides) for flight in spec.flight)
+    return Survey(
+        path=path,
+        title=spec.title,
+        out=out if out is not None else path.parent / (spec.out or f"{path.stem}.results"),
+        methods=tuple(dict.fromkeys(spec.methods)),
+        workers=spec.workers,
+        flights=flights,
+        config=layered_config([spec.config], overrides, where=str(path)),
+    )
+
+
+def slug(name: str) -> str:
+    """A flight's name in lower case, digits and hyphens, as Prefect wants its keys."""
+    return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
+
+
+def _flight(path: Path, spec: FlightSpec, config: Mapping[str, Any], overrides: list[str]) -> Flight:
+    where = f"{path}: flight {spec.name}"
+    if (spec.recording is None) == (spec.mine is None):
+        raise ConfigError(where, "needs a recording or a mine", expected="one of the two", todo="correct the survey")
+    return Flight(
+        name=spec.name,
+        recording=_existing(path, where, "recording", spec.recording),
+        sequence=_existing(path, where, "sequence", spec.sequence),
+        mine=_mine(path, where, spec.mine),
+        reference=_existing(path, where, "reference", spec.reference),
+        config=layered_config([config, spec.config], overrides, where=where),
+    )
+
+
+def _mine(survey: Path, where: str, written: str | None) -> Path | str | None:
+    """A word without folder and suffix names a built-in mine; which there are, simulation knows."""
+    if written is not None and re.fullmatch(r"[\w-]+", written) and not (survey.parent / written).exists():
+        return written
+    return _existing(survey, where, "mine", written)
+
+
+def _existing(survey: Path, where: str, key: str, written: str | None) -> Path | None:
+    if written is None:
+        return None
+    found = survey.parent / written
+    if not found.exists():
+        raise ConfigError(
+            where, f"{key} = {written!r}: no such file", expected="a path beside the survey file", todo="check the path"
+        )
+    return found
+
+
+def _refuse_equal_names(path: Path, names: list[str]) -> None:
+    seen: dict[str, str] = {}
+    for name in names:
+        if slug(name) in seen:
+            raise ConfigError(
+                path,
+                f"flights {seen[slug(name)]!r} and {name!r}",
+                expected="names that differ in letters or digits",
+                todo="rename one",
+            )
+        seen[slug(name)] = name
