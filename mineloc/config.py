@@ -41,7 +41,7 @@ class SimulateConfig(Section):
 
     length_m: float = Field(default=1000.0, gt=0, description="path length of the flight")
     speed_mps: float = Field(default=2.5, gt=0, le=15, description="on straight roadways; slower in bends")
-    accel_mps2: float = Field(default=1.2, gt=0, le=10)
+    accel_mps2: float = Field(default=1.5, gt=0, le=10)
     yaw_rate_degps: float = Field(default=60.0, gt=0, le=360)
     hover_s: float = Field(default=4.0, ge=1, description="at rest before the start and after the end")
     clearance_m: float = Field(default=0.7, gt=0, description="wanted distance to walls; half of it is the least")
@@ -125,6 +125,18 @@ class LoamConfig(Section):
 
 class GraphConfig(Section):
     """The pose factor graph."""
+
+    use_gravity: bool = True
+    gravity_sigma_deg: float = Field(default=1.0, gt=0, description="of the measured direction of up, one keyframe")
+    anchor_m: float = Field(default=0.001, gt=0, description="the first position defines the map")
+    anchor_yaw_deg: float = Field(default=0.01, gt=0, description="the first heading defines the map")
+    anchor_tilt_deg: float = Field(default=0.5, gt=0, description="of the first levelling")
+    relative_max_m: float = Field(default=3.0, gt=0, description="no motion between keyframes is known less")
+    relative_max_deg: float = Field(default=20.0, gt=0, description="no motion between keyframes is known less")
+    robust: bool = Field(default=True, description="Cauchy kernel on fixes and loops")
+    cauchy_k: float = Field(default=1.0, gt=0, description="in standard deviations")
+    max_iterations: int = Field(default=100, ge=1)
+    relinearize_threshold: float = Field(default=0.05, gt=0, description="metres or radians; causal estimate")
 
 
 class EvaluateConfig(Section):
