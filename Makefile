@@ -11,8 +11,8 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v p
 BIN := .venv/bin
 UV := $(BIN)/uv
 UV_INSTALL := $(UV) pip install --quiet --python $(BIN)/python --constraint constraints.txt --verify-hashes
-# What open3d and matplotlib load and a minimal Debian or Ubuntu does not have.
-SYSTEM := libgl1 libegl1 libgomp1 libx11-6
+# What open3d (and numba's OpenMP) loads and a minimal Debian or Ubuntu does not have.
+SYSTEM := libgl1 libegl1 libx11-6 libusb-1.0-0 libgomp1
 
 install: .stamps/product
 
@@ -49,14 +49,20 @@ distclean: clean
 # $(call system,what is missing,packages): installs them if this user may, else says the line to type.
 define system
 install="apt-get install --yes --no-install-recommends $(2)"
-if [ "$$(id -u)" -eq 0 ] && command -v apt-get >/dev/null; then
-	apt-get update --quiet --quiet
-	DEBIAN_FRONTEND=noninteractive $$install >/dev/null
-elif command -v apt-get >/dev/null && sudo -n true 2>/dev/null; then
-	sudo apt-get update --quiet --quiet
-	sudo DEBIAN_FRONTEND=noninteractive $$install >/dev/null
+if ! command -v apt-get >/dev/null; then
+	echo "$(1) is missing; install what Debian calls $(2)" >&2
+	exit 1
+elif [ "$$(id -u)" -eq 0 ]; then
+	as_root="env DEBIAN_FRONTEND=noninteractive"
+elif sudo -n true 2>/dev/null; then
+	as_root="sudo env DEBIAN_FRONTEND=noninteractive"
 else
-	echo "$(1) is missing; as root type: apt-get update && $$install" >&2
+	echo "$(1) is missing; type: sudo sh -c 'apt-get update && $$install'" >&2
+	exit 1
+fi
+echo "installing $(2)"
+if ! { $$as_root apt-get update && $$as_root $$install; } > .stamps/apt.log 2>&1; then
+	cat .stamps/apt.log >&2
 	exit 1
 fi
 endef
