@@ -91,7 +91,7 @@ class BagRecording:
             except Exception as error:  # noqa: BLE001  # as above
                 self._refuse(error, f"reading message {count + 1}")
             count += 1
-            yield RawMessage(self.topics[connection.topic], log_ns, data, decoders[connection.topic], _NO_NOTES)
+            yield RawMessage(self.topics[connection.topic], log_ns, log_ns, data, decoders[connection.topic], _NO_NOTES)
 
     def _decoder(self, connection: Connection) -> Decoder:
         topic = self.topics[connection.topic]

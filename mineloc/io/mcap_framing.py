@@ -62,6 +62,7 @@ class MessageRecord(NamedTuple):
 
     channel_id: int
     log_ns: int
+    publish_ns: int
     data: memoryview
 
 
@@ -180,8 +181,8 @@ def messages_in(
         if opcode == Opcode.MESSAGE:
             if length < _MESSAGE_FIELDS:
                 raise RecordError("a message record without its header")
-            _, _, channel_id, _, log_ns, _ = _MESSAGE.unpack_from(view, position)
-            yield MessageRecord(channel_id, log_ns, view[start + _MESSAGE_FIELDS : start + length])
+            _, _, channel_id, _, log_ns, publish_ns = _MESSAGE.unpack_from(view, position)
+            yield MessageRecord(channel_id, log_ns, publish_ns, view[start + _MESSAGE_FIELDS : start + length])
         elif opcode == Opcode.SCHEMA and schemas is not None:
             _define(schemas, parse_record(Schema, view[start : start + length]))
         elif opcode == Opcode.CHANNEL and channels is not None:

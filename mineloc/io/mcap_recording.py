@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Generator, Iterable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
@@ -183,7 +183,7 @@ def _load_index(path: Path, file: BinaryIO, size: int) -> McapIndex:
     return index
 
 
-def _load(file: BinaryIO, segments: Iterable[Segment]) -> Iterator[_Loaded]:
+def _load(file: BinaryIO, segments: Iterable[Segment]) -> Generator[_Loaded]:
     for segment in segments:
         try:
             yield segment, _plain(file, segment)
@@ -213,10 +213,12 @@ def _messages_of(
         raise plain
     found: list[_Waiting] = []
     counts: dict[int, int] = {}
-    for channel_id, log_ns, data in messages_in(plain):
+    for channel_id, log_ns, publish_ns, data in messages_in(plain):
         known = wanted.get(channel_id)
         if known is not None:
-            found.append((log_ns, number, len(found), RawMessage(known[0], log_ns, data, known[1], known[2])))
+            topic, decode, notes = known
+            raw = RawMessage(topic, log_ns, publish_ns, data, decode, notes)
+            found.append((log_ns, number, len(found), raw))
             counts[channel_id] = counts.get(channel_id, 0) + 1
     # only now: a chunk that turns out damaged half-way delivers nothing
     for channel_id, count in counts.items():

@@ -143,7 +143,7 @@ class _Scan:
     def _count(self, offset: int, length: int, plain: bytes | memoryview, *, is_chunk: bool) -> None:
         counts: dict[int, int] = {}
         stamps: list[int] = []
-        for channel_id, log_ns, _ in messages_in(plain, schemas=self.index.schemas, channels=self.index.channels):
+        for channel_id, log_ns, _, _ in messages_in(plain, schemas=self.index.schemas, channels=self.index.channels):
             counts[channel_id] = counts.get(channel_id, 0) + 1
             stamps.append(log_ns)
         if not stamps:

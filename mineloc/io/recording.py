@@ -75,20 +75,29 @@ class RawMessage:
     """One message as it is stored, decoded when asked.
 
     Attributes:
-        topic, msgtype: as in `Topic`.
-        log_ns: when the recorder received it.
+        topic, msgtype, encoding: as in `Topic`.
+        log_ns: when the recorder received it; the order of the file.
+        publish_ns: when it was sent, as far as the recorder knew; else as `log_ns`.
         data: the serialised bytes, a view that is valid as long as it is held.
         notes: what the file says about the channel, such as its quality of service.
     """
 
-    __slots__ = ("_decode", "data", "log_ns", "msgtype", "notes", "topic")
+    __slots__ = ("_decode", "data", "encoding", "log_ns", "msgtype", "notes", "publish_ns", "topic")
 
     def __init__(
-        self, topic: Topic, log_ns: int, data: bytes | memoryview, decode: Decoder, notes: Mapping[str, str]
+        self,
+        topic: Topic,
+        log_ns: int,
+        publish_ns: int,
+        data: bytes | memoryview,
+        decode: Decoder,
+        notes: Mapping[str, str],
     ) -> None:
         self.topic = topic.name
         self.msgtype = topic.msgtype
+        self.encoding = topic.encoding
         self.log_ns = log_ns
+        self.publish_ns = publish_ns
         self.data = data
         self.notes = notes
         self._decode = decode
