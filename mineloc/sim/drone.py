@@ -26,7 +26,7 @@ def drone_motion(
         plan: where to be when.
         scene: the mine.
         vibration: of the body.
-        sway_m: standard deviation of the wander where there is room, horizontally (60 % of it vertically).
+        sway_m: standard deviation of the wander where there is room, to the side (60 % of it in height).
         clearance_m: distance to the walls below which the wander is damped.
         rng: the wander.
 
@@ -46,11 +46,12 @@ def drone_motion(
 
 
 def _sway(plan: Schedule, scene: Scene, sway_m: float, clearance_m: float, rng: np.random.Generator) -> F64:
-    """(n, 3) positions with slow wander, less where the walls are near."""
+    """(n, 3) positions with slow wander to the side and in height, less where the walls are near."""
     blur = SWAY_S / plan.step_s
-    wander = gaussian_filter1d(rng.standard_normal((len(plan.positions_m), 3)), blur, axis=0, mode="nearest")
+    noise = gaussian_filter1d(rng.standard_normal((len(plan.positions_m), 2)), blur, axis=0, mode="nearest")
     # a Gaussian of width b leaves 1/√(2 b √π) of the deviation of white noise
-    wander *= np.sqrt(2 * blur * np.sqrt(np.pi)) * sway_m * np.array([1.0, 1.0, 0.6]) * plan.moving[:, None]
+    side, up = (np.sqrt(2 * blur * np.sqrt(np.pi)) * sway_m * noise * [1.0, 0.6] * plan.moving[:, None]).T
+    wander = np.column_stack([-np.sin(plan.yaw_rad) * side, np.cos(plan.yaw_rad) * side, up])
     weight = np.ones(len(wander))
     for _ in range(8):
         near = scene.clearance_m(plan.positions_m + weight[:, None] * wander) < clearance_m

@@ -14,7 +14,7 @@ from mineloc.sim.imu import Imu, ImuNoise, lever
 from mineloc.sim.lidar import LidarModel, lidar_model
 from mineloc.sim.drone import drone_motion
 from mineloc.sim.motion import Vibration
-from mineloc.sim.path import fly_line
+from mineloc.sim.path import fly_line, passable
 from mineloc.sim.roadways import RoadwayGraph
 from mineloc.sim.scene import Scene
 from mineloc.sim.schedule import Limits, Schedule, schedule
@@ -65,6 +65,7 @@ class SimulatedFlight:
             T_body_imu=lever(-0.5, 0.3, 0.8, (-0.04, 0.03, 0.02)),
         )
         tour_rng, sway_rng, shake_rng = (_rng(config.seed, stream) for stream in (1, 2, 3))
+        graph = passable(graph, scene, clearance_m=config.clearance_m)
         self.tour = plan_tour(graph, config.length_m * 1.1, tour_rng)
         legs = cut(fly_line(graph, self.tour, scene, clearance_m=config.clearance_m), config.length_m)
         limits = Limits(config.speed_mps, config.accel_mps2, np.deg2rad(config.yaw_rate_degps), config.hover_s)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from mineloc.errors import SimulationError
-from mineloc.sim.roadways import RoadwayGraph
+from mineloc.sim.roadways import Roadway, RoadwayGraph
 from mineloc.sim.scene import Scene
 from mineloc.sim.tour import Step
 
@@ -17,6 +17,7 @@ STEP_M = 0.1
 ROUNDING_M = 0.8
 RELAXATIONS = 12
 HIGHEST_FLIGHT_M = 3.0
+SHORTEST_BLIND_M = 3.0
 
 
 def fly_line(graph: RoadwayGraph, tour: list[Step], scene: Scene, *, clearance_m: float) -> list[F64]:
@@ -31,7 +32,25 @@ def fly_line(graph: RoadwayGraph, tour: list[Step], scene: Scene, *, clearance_m
     Raises:
         SimulationError: a roadway without roof or floor, or too narrow.
     """
-    return [clear_line(round_line(mid_height(leg, scene)), scene, clearance_m=clearance_m) for leg in _legs(graph, tour)]
+    out: list[F64] = []
+    for leg in _legs(graph, tour):
+        line = clear_line(round_line(mid_height(leg, scene)), scene, clearance_m=clearance_m)
+        _check(line, scene, clearance_m / 2)
+        out.append(line)
+    return out
+
+
+def _check(line_m: F64, scene: Scene, least_m: float) -> None:
+    distance = scene.clearance_m(line_m)
+    worst = int(distance.argmin())
+    if distance[worst] < least_m:
+        x, y, z = line_m[worst]
+        raise SimulationError(
+            "mine",
+            f"only {distance[worst]:.2f} m to the wall at ({x:.1f}, {y:.1f}, {z:.1f})",
+            expected=f"{least_m:.2f} m",
+            todo="choose another start or lower simulate.clearance_m",
+        )
 
 
 def _legs(graph: RoadwayGraph, tour: list[Step]) -> list[F64]:
@@ -90,28 +109,66 @@ def round_line(line_m: F64) -> F64:
 
 
 def clear_line(line_m: F64, scene: Scene, *, clearance_m: float) -> F64:
-    """Push the line away from walls that are nearer than `clearance_m`, keeping it smooth.
-
-    Raises:
-        SimulationError: there is less than half of the clearance even so.
-    """
-    line = line_m.copy()
+    """Push the line away from walls that are nearer than `clearance_m`, keeping it smooth; the best of some tries."""
+    line, best, least = line_m.copy(), line_m, np.inf
     for _ in range(RELAXATIONS):
         away = line - scene.nearest_m(line)
         distance = np.linalg.norm(away, axis=1)
         lack = np.maximum(clearance_m * 1.1 - distance, 0.0)
+        if (cost := float((lack**2).sum())) < least:
+            best, least = line.copy(), cost
         if not lack.any():
             break
         push = away / np.maximum(distance, 1e-6)[:, None] * lack[:, None]
-        line += gaussian_filter1d(push, 0.5 / STEP_M, axis=0, mode="nearest") * 1.5
-    distance = scene.clearance_m(line)
-    worst = int(distance.argmin())
-    if distance[worst] < clearance_m / 2:
-        x, y, z = line[worst]
+        line = line + gaussian_filter1d(push, 0.5 / STEP_M, axis=0, mode="nearest")
+    return resample(best)
+
+
+def passable(graph: RoadwayGraph, scene: Scene, *, clearance_m: float) -> RoadwayGraph:
+    """The roadways that a drone fits through; blind ones end before they get too narrow or low.
+
+    Args:
+        graph: the roadways.
+        scene: the mine.
+        clearance_m: wanted distance to floor, roof and walls; 3/4 of it counts as passable.
+
+    Raises:
+        SimulationError: none is left.
+    """
+    degree = [len(roads) for roads in graph.at_node()]
+    nodes = graph.nodes_m.copy()
+    kept: list[Roadway] = []
+    for road in graph.roadways:
+        floor = resample(road.line_m)
+        room = scene.clearance_m(clear_line(mid_height(floor, scene), scene, clearance_m=clearance_m))
+        # relaxing changes the number of points a little; what matters is where it is tight
+        narrow = np.flatnonzero(room < 0.75 * clearance_m) / max(len(room) - 1, 1) * (len(floor) - 1)
+        first, last = _open_part(narrow, len(floor), blind_a=degree[road.a] == 1, blind_b=degree[road.b] == 1)
+        if last - first >= SHORTEST_BLIND_M / STEP_M or (not len(narrow) and degree[road.a] + degree[road.b] > 2):
+            kept.append(Roadway(road.a, road.b, floor[first : last + 1]))
+            nodes[road.a], nodes[road.b] = kept[-1].line_m[0], kept[-1].line_m[-1]
+    if not kept:
         raise SimulationError(
             "mine",
-            f"only {distance[worst]:.2f} m to the wall at ({x:.1f}, {y:.1f}, {z:.1f})",
-            expected=f"{clearance_m / 2:.2f} m",
-            todo="choose another start or lower simulate.clearance_m",
+            f"no roadway with {0.75 * clearance_m:.2f} m around its middle",
+            expected="room for a drone",
+            todo="check the mesh's unit, or lower simulate.clearance_m",
         )
-    return resample(line)
+    return RoadwayGraph(nodes, tuple(kept))
+
+
+def _open_part(narrow: F64, count: int, *, blind_a: bool, blind_b: bool) -> tuple[int, int]:
+    """First and last index of a roadway that can be flown; last < first if it is shut between two intersections."""
+    margin = round(0.5 / STEP_M)
+    if not len(narrow):
+        return 0, count - 1
+    if blind_b and not blind_a:
+        return 0, int(narrow[0]) - margin
+    if blind_a and not blind_b:
+        return int(narrow[-1]) + 1 + margin, count - 1
+    if blind_a and blind_b:
+        # a mine of one roadway: the longest stretch between narrow places
+        edges = np.concatenate([[-1.0], narrow, [float(count)]])
+        widest = int(np.diff(edges).argmax())
+        return int(edges[widest]) + 1 + margin, int(edges[widest + 1]) - margin
+    return 0, -1

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
-U32 = NDArray[np.uint32]
 I64 = NDArray[np.int64]
 
 
@@ -27,6 +26,21 @@ class Hits:
     normals: F32
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Crossings:
+    """Where vertical rays go through the mesh, sorted by ray and height.
+
+    Attributes:
+        ray: (k,) number of the ray.
+        height_m: (k,) above its origin.
+        upward: (k,) upward component of the normal of the triangle, as wound.
+    """
+
+    ray: I64
+    height_m: F64
+    upward: F64
+
+
 class Scene:
     """A triangle mesh ready for ray casting. Not shared between processes.
 
@@ -40,6 +54,9 @@ class Scene:
         vertices = np.asarray(vertices_m, dtype=np.float64)
         # Embree counts in float32: 3 cm at 500 km of a mine grid, so the scene lives around its own origin
         self.origin_m: F64 = np.round((vertices.min(axis=0) + vertices.max(axis=0)) / 2)
+        corners = vertices[np.asarray(triangles)]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        self._upward: F64 = normals[:, 2] / np.maximum(np.linalg.norm(normals, axis=1), 1e-30)
         self._scene = o3d.t.geometry.RaycastingScene(nthreads=threads)
         self._scene.add_triangles(
             o3d.core.Tensor(np.ascontiguousarray(vertices - self.origin_m, dtype=np.float32)),
@@ -67,20 +84,12 @@ class Scene:
         """(n,) distance of each point to the mesh."""
         return np.linalg.norm(points_m - self.nearest_m(points_m), axis=1)
 
-    def verticals(self, origins_m: F64) -> list[tuple[F64, F64]]:
-        """For each (n, 3) origin all crossings of the ray straight up.
-
-        Returns:
-            A list of (heights above the origin in rising order, upward component of the triangle's normal as wound).
-        """
-        local = np.ascontiguousarray(
-            np.concatenate([origins_m - self.origin_m, np.broadcast_to([0.0, 0.0, 1.0], origins_m.shape)], axis=1),
-            dtype=np.float32,
-        )
-        found = self._scene.list_intersections(o3d.core.Tensor(local))
-        splits: I64 = found["ray_splits"].numpy().astype(np.int64)
-        heights = found["t_hit"].numpy().astype(np.float64)
-        ids: U32 = found["primitive_ids"].numpy()
-        return [
-            (heights[a:b], ids[a:b].astype(np.float64)) for a, b in zip(splits[:-1], splits[1:], strict=True)
-        ]
+    def verticals(self, origins_m: F64) -> Crossings:
+        """All surfaces that rays straight up from (n, 3) origins cross, in rising order for each ray."""
+        local = origins_m - self.origin_m
+        rays = np.concatenate([local, np.broadcast_to([0.0, 0.0, 1.0], local.shape)], axis=1)
+        found = self._scene.list_intersections(o3d.core.Tensor(np.ascontiguousarray(rays, dtype=np.float32)))
+        ray = found["ray_ids"].numpy().astype(np.int64)
+        height = found["t_hit"].numpy().astype(np.float64)
+        order = np.lexsort((height, ray))
+        return Crossings(ray[order], height[order], self._upward[found["primitive_ids"].numpy()[order]])
