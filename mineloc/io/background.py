@@ -91,10 +91,10 @@ class OrderedPipeline(Generic[T]):
         self._written.append(self._writer.submit(self._consume_one, prepared))
 
     def _consume_one(self, prepared: Future[T]) -> None:
-        if self._failed.is_set():
-            return
         try:
-            self._consume(prepared.result())
+            item = prepared.result()
+            if not self._failed.is_set():
+                self._consume(item)
         except BaseException:
             self._failed.set()
             raise

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mineloc import se3
 from mineloc.data import Calibration, ImuSamples, Sweep, Trajectory
 from mineloc.io.cdr_layout import CdrLayout, Part, Text, fixed_layout, rows, stamps_ns
+from mineloc.io.pointcloud2 import strided
 from mineloc.io.ros import POINT_CLOUD2, STORE, TF_MESSAGE, stamp_parts
 
 I64 = NDArray[np.int64]
@@ -55,9 +56,9 @@ def encode_sweep(sweep: Sweep) -> memoryview:
     out[start - 4 : start] = np.frombuffer(struct.pack("<I", n * step), np.uint8)
     # x y z as one piece: a structured array takes three times as long.
     points = np.ascontiguousarray(sweep.points_lidar, dtype="<f4").view("V12").reshape(n)
-    np.ndarray((n,), "V12", out, start, (step,))[...] = points
+    strided(out, "V12", start, n, step)[...] = points
     for field, values in zip(fields[3:], _extra_columns(sweep), strict=True):
-        np.ndarray((n,), _NUMPY[field.datatype], out, start + field.offset, (step,))[...] = values
+        strided(out, _NUMPY[field.datatype], start + field.offset, n, step)[...] = values
     return out.data
 
 
@@ -91,14 +92,14 @@ def decode_sweep(data: bytes | memoryview, *, period_ns: int) -> Sweep:
     if names[:3] != ["x", "y", "z"] or message.height != 1 or message.is_bigendian or len(message.data) != n * step:
         raise ValueError("not a canonical cloud")
     columns = {
-        str(field.name): np.ndarray((n,), _NUMPY[field.datatype], message.data, field.offset, (step,))
+        str(field.name): strided(message.data, _NUMPY[field.datatype], field.offset, n, step)
         for field in message.fields[3:]
     }
     offsets = columns.get("t")
     intensity, ring = columns.get("intensity"), columns.get("ring")
     return Sweep(
         int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec),
-        np.ndarray((n,), "V12", message.data, 0, (step,)).copy().view("<f4").reshape(n, 3),
+        strided(message.data, "V12", 0, n, step).copy().view("<f4").reshape(n, 3),
         None if offsets is None else offsets.astype(np.int64),
         None if ring is None else ring.copy(),
         None if intensity is None else intensity.copy(),

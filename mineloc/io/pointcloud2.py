@@ -136,12 +136,19 @@ def _row_step(cloud: Any, where: str) -> int:
     return row_step
 
 
+def strided(buffer: NDArray[np.uint8], form: str, offset: int, n: int, step: int) -> Column:
+    """A view of n values of a numpy format, `step` bytes apart; writable when the buffer is."""
+    # numpy refuses strides over an empty buffer
+    return np.ndarray((n,), form, buffer, offset, (step,)) if n else np.empty(0, form)
+
+
 def _column(
     data: NDArray[np.uint8], place: tuple[str, int], shape: tuple[int, int], strides: tuple[int, int]
 ) -> Column:
-    if shape[0] == 1 or strides[0] == shape[1] * strides[1]:
+    n = shape[0] * shape[1]
+    if shape[0] == 1 or strides[0] == shape[1] * strides[1] or n == 0:
         # one run of points: numpy copies it twice as fast as rows
-        return np.ndarray((shape[0] * shape[1],), place[0], data, place[1], (strides[1],))
+        return strided(data, place[0], place[1], n, strides[1])
     return np.ndarray(shape, place[0], data, place[1], strides)
 
 
@@ -223,7 +230,8 @@ def returns(cloud: RawCloud) -> tuple[Bool | None, int, int, int]:
     if x_zero.any():
         origin = x_zero & (points[:, 1] == 0) & (points[:, 2] == 0)
         at_origin = int(np.count_nonzero(origin))
-        mask = ~origin if mask is None else mask & ~origin
+        if at_origin:
+            mask = ~origin if mask is None else mask & ~origin
     if cloud.time is not None and cloud.time.dtype.kind == "f":
         timed = np.isfinite(cloud.time)
         if not timed.all():
