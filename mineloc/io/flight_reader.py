@@ -160,18 +160,18 @@ class FlightReader:
     def _steps(self) -> Generator[tuple[Sweep, ImuSamples]]:
         held: deque[Sweep] = deque()
         samples: list[RawRecord] = []
+        felt_ns = -1  # time of the latest sample
         for item in self._items(layout.POINTS, layout.IMU_TOPIC):
-            if isinstance(item, Sweep):
-                now_ns = item.end_ns
-                held.append(item)
-            else:
-                now_ns = item.log_ns
+            now_ns = item.end_ns if isinstance(item, Sweep) else item.log_ns
             while held and now_ns > held[0].end_ns + _PATIENCE_NS:
                 yield held.popleft(), self._decode_imu(samples)
                 samples = []
-            if isinstance(item, RawRecord):
+            if isinstance(item, Sweep):
+                held.append(item)
+            else:
                 samples.append(item)
-            while held and samples and samples[-1].log_ns >= held[0].end_ns:
+                felt_ns = item.log_ns
+            while held and felt_ns >= held[0].end_ns:
                 yield held.popleft(), self._decode_imu(samples)
                 samples = []
         for sweep in held:

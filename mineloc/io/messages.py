@@ -103,7 +103,8 @@ class ImuDecoder:
         accel = float(np.median(np.linalg.norm(np.concatenate([s.accel_mps2 for s in self._unchecked]), axis=1)))
         gyro = float(np.median(np.linalg.norm(np.concatenate([s.gyro_radps for s in self._unchecked]), axis=1)))
         self._checked, self._unchecked = True, []
-        if not _PLAUSIBLE_ACCEL_MPS2[0] <= accel <= _PLAUSIBLE_ACCEL_MPS2[1]:
+        # a dead sensor, all zero, is no unit mistake
+        if accel and not _PLAUSIBLE_ACCEL_MPS2[0] <= accel <= _PLAUSIBLE_ACCEL_MPS2[1]:
             raise IngestError(
                 self._where,
                 f"median acceleration {accel:.3g} m/s²",

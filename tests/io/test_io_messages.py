@@ -86,6 +86,27 @@ def test_imu_units_are_converted():
     _same(decoder.decode(raw), truth)
 
 
+@pytest.mark.parametrize(
+    ("scale", "rules", "match"),
+    [
+        ((1.0, STANDARD_GRAVITY_MPS2), ImuRules(), r"acceleration 0\.999 m/s².*about 9\.8.*accel_unit"),
+        ((1.0, 1.0), ImuRules(accel_unit="g"), r"acceleration 96\.1 m/s².*accel_unit"),
+        ((0.001, 1.0), ImuRules(), r"angular rate \d+ rad/s.*gyro_unit"),
+    ],
+)
+def test_wrong_units_are_refused_once_enough_is_seen(scale, rules, match):
+    raw, _ = _samples(300, scale=scale)
+    decoder = ImuDecoder(rules, where="x.bag: /imu")
+    assert len(decoder.decode(raw[:199])) == 199
+    with pytest.raises(IngestError, match=match):
+        decoder.decode(raw[199:])
+
+
+def test_a_dead_sensor_is_no_unit_mistake():
+    raw = [_imu(H + i, (0, 0, 0), (0, 0, 0)) for i in range(300)]
+    assert len(ImuDecoder(ImuRules(), where="x").decode(raw)) == 300
+
+
 @given(st.lists(st.integers(0, 12), max_size=30), st.integers(0, 29), st.integers(1, 9))
 def test_only_later_finite_samples_pass(stamps, bad, portion):
     """In any portions: each kept sample is later than all kept before; what is dropped is counted."""
