@@ -114,7 +114,8 @@ class Store:
                 return known
             self._discard_damage(action)
             start = time.perf_counter()
-            output = execute(workspace)
+            with one_line_errors(self.root):
+                output = execute(workspace)
             seconds = time.perf_counter() - start
             ref = self.objects.adopt(output, volatile=volatile)
             record = self.records.write(action, ref, seconds, workspace=workspace)
