@@ -1,0 +1,79 @@
+"""Curves along the flight: error, uncertainty, methods beside each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from mineloc.data import F64, Trajectory
+from mineloc.report.svg import BLACK, DASHES, ORANGE, SERIES, WIDTH_IN, draw, keep_peaks
+
+_MAX_BANDS = 400
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    """A stretch of the flight, in metres flown."""
+
+    from_m: float
+    to_m: float
+    kind: Literal["degenerate", "untrusted"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Curve:
+    """A number along the flight: `y` (n,) at `along_m` (n,), not falling."""
+
+    name: str
+    along_m: F64
+    y: F64
+
+
+def curves(key: str, lines: Sequence[Curve], *, bands: Sequence[Band], x_label: str, y_label: str, alt: str) -> str:
+    """SVG of curves over the metres flown, from zero, with stretches shaded."""
+
+    def paint(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        shade(axes, bands)
+        for i, line in enumerate(lines):
+            pick = keep_peaks(line.along_m, line.y)
+            axes.plot(
+                line.along_m[pick],
+                line.y[pick],
+                label=line.name,
+                color=SERIES[i % len(SERIES)],
+                linestyle=DASHES[i % len(DASHES)],
+                marker="o" if len(pick) == 1 else None,  # a line of one pose would be invisible
+            )
+        top = max((float(line.y.max()) for line in lines), default=0.0)
+        axes.set_ylim(0.0, max(1.08 * top, 1e-3))
+        axes.margins(x=0.01)
+        axes.set_xlabel(x_label)
+        axes.set_ylabel(y_label)
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, borderaxespad=0.2)
+
+    return draw(key, (WIDTH_IN, 2.5), paint, alt=alt)
+
+
+def shade(axes: Axes, bands: Sequence[Band]) -> None:
+    """Shade stretches over the whole height: degenerate ones orange, untrusted ones grey."""
+    named: set[str] = set()
+    # the longest are the ones that can be seen
+    for band in sorted(sorted(bands, key=lambda b: b.from_m - b.to_m)[:_MAX_BANDS], key=lambda b: b.from_m):
+        label = band.kind if band.kind not in named else None
+        named.add(band.kind)
+        if band.kind == "degenerate":
+            axes.axvspan(band.from_m, band.to_m, color=ORANGE, alpha=0.3, linewidth=0, label=label)
+        else:
+            axes.axvspan(band.from_m, band.to_m, color=BLACK, alpha=0.45, linewidth=0.8, label=label)
+
+
+def metres_at(trajectory: Trajectory, stamp_ns: int) -> float:
+    """Metres flown at a time, held at the ends."""
+    start = trajectory.stamps_ns[0]
+    return float(np.interp(stamp_ns - start, trajectory.stamps_ns - start, trajectory.path_m))

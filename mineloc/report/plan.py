@@ -1,0 +1,219 @@
+"""The mine from above and from the side, with the flight in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from mineloc.data import F64
+from mineloc.report.along import Band, shade
+from mineloc.report.svg import BLACK, BLUE, WIDTH_IN, draw, error_colors, keep_peaks
+from mineloc.stages.run_folder import RunFolder
+
+_PIXELS = 1000  # longer side of the raster of points
+_MIN_PIXEL_M = 0.1
+_CHUNK = 1 << 18
+_MAX_VERTICES = 2000
+_COLORED_DPI = 220
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Density:
+    """How many points lie over each cell of the plan.
+
+    Attributes:
+        counts: (rows, columns), row 0 at the smallest y.
+        extent_m: x from, x to, y from, y to.
+    """
+
+    counts: F64
+    extent_m: tuple[float, float, float, float]
+
+
+def density(run: RunFolder, T_frame_map: F64) -> Density | None:
+    """The keyframe points, placed by the smoothed poses and seen from above; None without points.
+
+    Args:
+        run: its points are walked in chunks: memory does not grow with them.
+        T_frame_map: (4, 4) from the run's map to the frame of the figure.
+    """
+    table = run.points()
+    if table.is_empty():
+        return None
+    poses = T_frame_map @ run.keyframe_poses
+    rows_of = np.searchsorted(run.keyframes["index"].to_numpy(), table["keyframe"].to_numpy())
+    points = table.select("x_m", "y_m", "z_m").to_numpy()
+    chunks = [slice(at, at + _CHUNK) for at in range(0, len(points), _CHUNK)]
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for part in chunks:
+        xy = _plan_xy(poses, rows_of[part], points[part])
+        low, high = np.minimum(low, xy.min(axis=0)), np.maximum(high, xy.max(axis=0))
+    pixel_m = max(float((high - low).max()) / _PIXELS, _MIN_PIXEL_M)
+    columns, rows = (np.ceil((high - low) / pixel_m).astype(int) + 1).tolist()
+    counts = np.zeros(rows * columns)
+    for part in chunks:
+        cell = ((_plan_xy(poses, rows_of[part], points[part]) - low) / pixel_m).astype(np.int64)
+        counts += np.bincount(cell[:, 1] * columns + cell[:, 0], minlength=rows * columns)
+    extent = (low[0], low[0] + columns * pixel_m, low[1], low[1] + rows * pixel_m)
+    return Density(counts.reshape(rows, columns), extent)
+
+
+def _plan_xy(poses: F64, rows_of: Any, points: Any) -> F64:
+    pose = poses[rows_of, :2]
+    return np.einsum("nij,nj->ni", pose[:, :, :3], points.astype(np.float64)) + pose[:, :, 3]
+
+
+def plan_view(
+    key: str,
+    *,
+    background: Density | None,
+    reference: F64 | None,
+    estimate: F64,
+    value: F64 | None,
+    label: str,
+) -> str:
+    """SVG of the flight over the mine, equal aspect.
+
+    Args:
+        key: prefix of identifiers.
+        background: the points of the mine.
+        reference: (n, 3) positions, drawn thin and black.
+        estimate: (m, 3) positions.
+        value: (m,) what colours the estimate, metres; None for one colour.
+        label: what `value` is, with its unit.
+    """
+    x0, x1, y0, y1 = _bounds(background, reference, estimate)
+    height = float(np.clip(6.0 * (y1 - y0) / (x1 - x0) + 0.9, 2.6, 8.6))
+
+    def paint(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        axes.set_aspect("equal")
+        axes.set_xlim(x0, x1)
+        axes.set_ylim(y0, y1)
+        if background is not None:
+            _paint_density(axes, background)
+        if reference is not None:
+            thin = reference[_spread(len(reference))]
+            axes.plot(thin[:, 0], thin[:, 1], color=BLACK, linewidth=0.5, label="reference")
+        if value is None:
+            thin = estimate[_spread(len(estimate))]
+            axes.plot(thin[:, 0], thin[:, 1], color=BLUE, linewidth=1.2, label="estimate")
+        else:
+            _paint_colored(figure, axes, estimate, value, label)
+        axes.plot(*estimate[0, :2], "o", color=BLACK, markersize=4, markerfacecolor="white", label="start")
+        axes.plot(*estimate[-1, :2], "s", color=BLACK, markersize=3.5, label="end")
+        axes.set_xlabel("x (m)")
+        axes.set_ylabel("y (m)")
+        _paint_scale(axes, x1 - x0)
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, borderaxespad=0.2)
+
+    return draw(key, (WIDTH_IN, height), paint, alt="Plan view: the estimated trajectory over the points of the mine")
+
+
+def long_section(
+    key: str, *, along_m: F64, smoothed_z: F64, reference_z: F64 | None, bands: list[Band], unit: str
+) -> str:
+    """SVG of the height along the way.
+
+    Args:
+        key: prefix of identifiers.
+        along_m: (n,) metres flown.
+        smoothed_z: (n,) estimated height.
+        reference_z: (n,) reference height.
+        bands: stretches to shade.
+        unit: label of the horizontal axis.
+    """
+
+    def paint(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        shade(axes, bands)
+        pick = keep_peaks(along_m, smoothed_z)
+        if reference_z is not None:
+            chosen = keep_peaks(along_m, reference_z)
+            axes.plot(along_m[chosen], reference_z[chosen], color=BLACK, linewidth=2.2, alpha=0.35, label="reference")
+        axes.plot(along_m[pick], smoothed_z[pick], color=BLUE, linewidth=1.0, label="estimate, smoothed")
+        axes.set_xlabel(unit)
+        axes.set_ylabel("height z (m)")
+        axes.margins(x=0.01, y=0.12)
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, borderaxespad=0.2)
+
+    return draw(key, (WIDTH_IN, 1.9), paint, alt="Long section: height along the metres flown")
+
+
+def _bounds(background: Density | None, reference: F64 | None, estimate: F64) -> tuple[float, float, float, float]:
+    corners = [estimate[:, :2].min(axis=0), estimate[:, :2].max(axis=0)]
+    if reference is not None:
+        corners += [reference[:, :2].min(axis=0), reference[:, :2].max(axis=0)]
+    if background is not None:
+        x0, x1, y0, y1 = background.extent_m
+        corners += [np.array([x0, y0]), np.array([x1, y1])]
+    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+    margin = max(0.02 * float((high - low).max()), 1.0)
+    (x0, y0), (x1, y1) = (low - margin).tolist(), (high + margin).tolist()
+    # a long straight roadway still gets a strip that can be looked at
+    thin = 0.18 * max(x1 - x0, y1 - y0)
+    dx, dy = max(thin - (x1 - x0), 0.0) / 2, max(thin - (y1 - y0), 0.0) / 2
+    return x0 - dx, x1 + dx, y0 - dy, y1 + dy
+
+
+def _spread(n: int) -> Any:
+    return np.unique(np.linspace(0, n - 1, min(n, _MAX_VERTICES)).astype(int))
+
+
+def _paint_density(axes: Axes, density: Density) -> None:
+    occupied = density.counts[density.counts > 0]
+    full = max(float(np.percentile(occupied, 95)), 1.0)
+    # few levels of grey: the picture says where the walls are, and the file stays small
+    shade = np.ceil(np.clip(np.sqrt(density.counts / full), 0.0, 1.0) * 6.0) / 6.0
+    rgba = np.full((*density.counts.shape, 4), 120, dtype=np.uint8)
+    rgba[..., 3] = np.round(150.0 * shade).astype(np.uint8)
+    axes.imshow(rgba, extent=density.extent_m, origin="lower", interpolation="none", aspect="equal", zorder=0.5)
+
+
+def _paint_colored(figure: Figure, axes: Axes, estimate: F64, value: F64, label: str) -> None:
+    step = np.linalg.norm(np.diff(estimate[:, :2], axis=0, prepend=estimate[:1, :2]), axis=1)
+    pick = keep_peaks(np.cumsum(step), value, columns=_MAX_VERTICES)
+    xy, colored = estimate[pick, :2], value[pick]
+    lines = LineCollection(
+        list(np.stack([xy[:-1], xy[1:]], axis=1)), cmap=error_colors(), linewidth=2.0, capstyle="round", zorder=2.5
+    )
+    lines.set_array(np.maximum(colored[:-1], colored[1:]))
+    lines.set_clim(0.0, max(float(value.max()), 1e-3))
+    # thousands of short coloured pieces are smaller, and drawn faster, as a picture
+    lines.set_rasterized(True)
+    figure.set_dpi(_COLORED_DPI)
+    axes.add_collection(lines)
+    bar = figure.colorbar(lines, cax=axes.inset_axes((1.02, 0.0, 0.025, 1.0)))
+    bar.set_label(label)
+    bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+
+
+def _paint_scale(axes: Axes, width_m: float) -> None:
+    """Above the plan, where no data is: a bar of a round length."""
+    length = _round_length(0.2 * width_m)
+    right = axes.get_xlim()[1]
+    across = axes.get_xaxis_transform()
+    axes.plot(
+        [right - length, right], [1.02, 1.02], color=BLACK, linewidth=2.5, transform=across, clip_on=False,
+        solid_capstyle="butt",
+    )  # fmt: skip
+    axes.annotate(
+        f"{length:g} m",
+        (right - length, 1.02),
+        xycoords=across,
+        xytext=(-5, 0),
+        textcoords="offset points",
+        ha="right",
+        va="center",
+        fontsize=7.5,
+    )
+
+
+def _round_length(limit_m: float) -> float:
+    power = 10.0 ** np.floor(np.log10(limit_m))
+    return float(max(step for step in (1.0, 2.0, 5.0) if step * power <= limit_m) * power)

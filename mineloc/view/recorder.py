@@ -1,0 +1,131 @@
+"""`RunRecorder` turns what a run says into a Rerun recording; who tells it things knows nothing of Rerun.
+
+Positions are sent as float32: `origin_m` is subtracted first, or a mine grid's large coordinates would lose
+centimetres (PLATFORM 3). Clouds are rounded to centimetres, which makes the file a quarter smaller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from mineloc import se3
+from mineloc.data import F32, F64, I64
+
+TIMELINE = "time"
+APPLICATION = "mineloc"
+_DECIMALS = 2  # of metres
+
+Rgb = tuple[int, int, int]
+
+# Okabe and Ito (2008), told apart by the colour-blind
+WHITE: Rgb = (255, 255, 255)
+ORANGE: Rgb = (230, 159, 0)
+SKY: Rgb = (86, 180, 233)
+GREEN: Rgb = (0, 158, 115)
+YELLOW: Rgb = (240, 228, 66)
+VERMILION: Rgb = (213, 94, 0)
+
+
+class RunRecorder:
+    """Writes one `.rrd`. Use as a context manager: the file is complete when the block is left.
+
+    Args:
+        path: file to write.
+        recording_id: fixed for equal content, so that a viewer replaces an older recording of the same run.
+        name: shown in the viewer.
+        origin_m: (3,) subtracted from every position.
+        layout: what the viewer opens on.
+    """
+
+    def __init__(
+        self, path: Path, *, recording_id: str, name: str, origin_m: F64, layout: rrb.Blueprint | None = None
+    ) -> None:
+        self._origin = np.asarray(origin_m, dtype=np.float64)
+        # No automatic properties: they hold the time of writing, and equal runs shall give equal recordings.
+        self._stream = rr.RecordingStream(APPLICATION, recording_id=recording_id, send_properties=False)
+        self._stream.save(path, default_blueprint=layout)
+        self._stream.send_recording_name(name)
+        self._stream.send_property("origin", rr.AnyValues(origin_m=self._origin.tolist()))
+        self._stream.log("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stream.disconnect()
+
+    def cloud(self, entity: str, points_map: F64 | F32, *, colors: NDArray[np.uint8] | Rgb, radius_m: float) -> None:
+        """A cloud that is always there: (n, 3) map points, one colour or (n, 3) colours."""
+        self._stream.log(
+            entity, rr.Points3D(self._rounded(points_map), colors=np.asarray(colors), radii=radius_m), static=True
+        )
+
+    def lines(
+        self, entity: str, strips_map: Sequence[F64], *, colors: Sequence[Rgb] | Rgb, width_px: float = 1.5
+    ) -> None:
+        """Polylines that are always there, each (n, 3) in the map."""
+        strips = [self._local(strip) for strip in strips_map]
+        radius = rr.Radius.ui_points(width_px / 2)
+        self._stream.log(entity, rr.LineStrips3D(strips, colors=np.asarray(colors), radii=radius), static=True)
+
+    def moving(self, entity: str, stamps_ns: I64, poses: F64, *, axis_m: float) -> None:
+        """A frame that moves: `T_map_entity` (n, 4, 4) at its times, drawn as axes."""
+        position, xyzw = se3.to_xyzw(poses)
+        self._stream.send_columns(
+            entity,
+            [_times(stamps_ns)],
+            rr.Transform3D.columns(translation=self._local(position), quaternion=xyzw.astype(np.float32)),
+        )
+        self._stream.log(entity, rr.TransformAxes3D(axis_m), static=True)
+
+    def sweep(self, entity: str, stamp_ns: int, points_map: F64 | F32, *, color: Rgb, radius_m: float) -> None:
+        """The points of one sweep, (n, 3) in the map, shown until the next."""
+        self._stream.set_time(TIMELINE, timestamp=np.datetime64(stamp_ns, "ns"))
+        self._stream.log(entity, rr.Points3D(self._rounded(points_map), colors=color, radii=radius_m))
+        self._stream.reset_time()
+
+    def curve(self, entity: str, stamps_ns: I64, values: F64, *, name: str, color: Rgb) -> None:
+        """A number over time; times without a value (NaN) are left out."""
+        known = np.isfinite(values)
+        self._stream.log(entity, rr.SeriesLines(colors=color, names=name, widths=1.5), static=True)
+        if known.any():
+            self._stream.send_columns(entity, [_times(stamps_ns[known])], rr.Scalars.columns(scalars=values[known]))
+
+    def states(self, entity: str, changes: Mapping[int, str], *, colors: Mapping[str, Rgb]) -> None:
+        """A state over time: {time: name}, each valid until the next."""
+        look = rr.StateConfiguration(values=list(colors), colors=np.array(list(colors.values()), dtype=np.uint8))
+        self._stream.log(entity, look, static=True)
+        if changes:
+            stamps = np.array(list(changes), dtype=np.int64)
+            self._stream.send_columns(entity, [_times(stamps)], rr.StateChange.columns(state=list(changes.values())))
+
+    def decisions(self, entity: str, lines: Sequence[tuple[int, str, str]]) -> None:
+        """A log: (time, level, text) in order of time; levels are INFO, WARN, ERROR."""
+        if lines:
+            stamps, levels, texts = zip(*lines, strict=True)
+            columns = rr.TextLog.columns(text=list(texts), level=list(levels))
+            self._stream.send_columns(entity, [_times(np.array(stamps, dtype=np.int64))], columns)
+
+    def document(self, entity: str, markdown: str) -> None:
+        """A page of text that is always there."""
+        self._stream.log(entity, rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN), static=True)
+
+    def _local(self, points_map: F64 | F32) -> F32:
+        return (np.asarray(points_map, dtype=np.float64) - self._origin).astype(np.float32)
+
+    def _rounded(self, points_map: F64 | F32) -> F32:
+        return np.round(np.asarray(points_map, dtype=np.float64) - self._origin, _DECIMALS).astype(np.float32)
+
+
+def _times(stamps_ns: I64) -> rr.TimeColumn:
+    return rr.TimeColumn(TIMELINE, timestamp=stamps_ns.astype("datetime64[ns]"))
