@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import BinaryIO
 
@@ -49,6 +49,8 @@ _LZ4_LEVEL = -2
 # is, which saves a third of the time of writing and of every later reading.
 _WORTH_IT = 0.9
 _TRIED_BYTES = 32 << 10
+# More pieces than this (a sweep has two) are joined before they are written.
+_FEW_PIECES = 8
 _WORKERS = 2
 _DEPTH = 6
 
@@ -66,12 +68,13 @@ class _Chunk:
 
 @dataclass(frozen=True, slots=True)
 class _Ready:
-    """A chunk ready for the disk."""
+    """A chunk ready for the disk; `data` in pieces, `size` bytes together."""
 
     chunk: _Chunk
     crc: int
     compression: str
-    data: bytes
+    data: Sequence[bytes | memoryview]
+    size: int
 
 
 class McapWriter:
@@ -162,30 +165,37 @@ class McapWriter:
         self._pipeline.submit(lambda: self._prepare(chunk))
 
     def _prepare(self, chunk: _Chunk) -> _Ready:
-        data = b"".join(chunk.pieces)
-        chunk.pieces.clear()
-        crc = zlib.crc32(data)
-        if self._compression == "lz4" and _shrinks(data):
-            return _Ready(chunk, crc, "lz4", bytes(lz4.frame.compress(data, compression_level=_LZ4_LEVEL)))
-        if self._compression == "zstd":
-            return _Ready(chunk, crc, "zstd", zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(data))
-        return _Ready(chunk, crc, "", data)
+        pieces: Sequence[bytes | memoryview] = chunk.pieces
+        if len(pieces) > _FEW_PIECES:
+            pieces = [b"".join(pieces)]
+        crc = 0
+        for piece in pieces:
+            crc = zlib.crc32(piece, crc)
+        packed: bytes | None = None
+        if self._compression == "lz4" and _shrinks(pieces):
+            packed = bytes(lz4.frame.compress(b"".join(pieces), compression_level=_LZ4_LEVEL))
+        elif self._compression == "zstd":
+            packed = zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(b"".join(pieces))
+        if packed is None:
+            return _Ready(chunk, crc, "", pieces, chunk.size)
+        return _Ready(chunk, crc, self._compression, [packed], len(packed))
 
     def _put(self, item: _Ready | bytes) -> None:
         if isinstance(item, bytes):
             self._write(item)
             return
         chunk, name = item.chunk, item.compression.encode()
-        length = 8 + 8 + 8 + 4 + 4 + len(name) + 8 + len(item.data)
+        length = 8 + 8 + 8 + 4 + 4 + len(name) + 8 + item.size
         head = _CHUNK_TIMES.pack(Opcode.CHUNK, length, chunk.start_ns, chunk.end_ns, chunk.size, item.crc, len(name))
         start = self._at
-        self._write(head + name + struct.pack("<Q", len(item.data)))
-        self._write(item.data)
+        self._write(head + name + struct.pack("<Q", item.size))
+        for piece in item.data:
+            self._write(piece)
         index = ChunkIndex(
             chunk_length=self._at - start,
             chunk_start_offset=start,
             compression=item.compression,
-            compressed_size=len(item.data),
+            compressed_size=item.size,
             message_end_time=chunk.end_ns,
             message_index_length=0,
             message_index_offsets={},
@@ -199,7 +209,7 @@ class McapWriter:
         index.message_index_length = self._at - index_start
         self._chunks.append(index)
 
-    def _write(self, data: bytes) -> None:
+    def _write(self, data: bytes | memoryview) -> None:
         self._stream.write(data)
         self._at += len(data)
 
@@ -258,10 +268,11 @@ class McapWriter:
         )
 
 
-def _shrinks(data: bytes) -> bool:
-    """Whether lz4 is worth its time, from a part in the middle: the same bytes always give the same answer."""
-    middle = len(data) // 2
-    part = data[max(0, middle - _TRIED_BYTES // 2) : middle + _TRIED_BYTES // 2]
+def _shrinks(pieces: Sequence[bytes | memoryview]) -> bool:
+    """Whether lz4 is worth its time, from the middle of the largest piece: the same bytes give the same answer."""
+    largest = max(pieces, key=len)
+    middle = len(largest) // 2
+    part = largest[max(0, middle - _TRIED_BYTES // 2) : middle + _TRIED_BYTES // 2]
     return len(lz4.frame.compress(part, compression_level=_LZ4_LEVEL)) < _WORTH_IT * len(part)
 
 
