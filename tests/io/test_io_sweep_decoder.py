@@ -244,3 +244,22 @@ def test_real_robosense_like_message():
     np.testing.assert_array_equal(
         np.sort(raw[:, :4].copy().view("<f4")[:, 0])[-5:], np.sort(sweep.points_lidar[:, 0])[-5:]
     )
+
+
+@pytest.mark.data
+def test_real_rings_and_times_are_recovered_without_their_fields():
+    path = DATA / "recordings" / "cloudini_pointcloud2_cdr.bin"
+    if not path.exists():
+        pytest.skip("../shared/data is absent")
+    message = STORE.deserialize_cdr(path.read_bytes(), POINT_CLOUD2)
+    (truth,), _ = _decode([message])
+    message.fields = message.fields[:4]
+    (found,), decoder = _decode([message], LidarRules(times="azimuth", rate_hz=20.0))
+    assert _names(decoder)["rings_recovered"] == 1
+    # two orders of time: compare point by point
+    a, b = (d.sweep.keep(np.argsort(_keys(d.sweep.points_lidar), kind="stable")) for d in (truth, found))
+    np.testing.assert_array_equal(a.points_lidar, b.points_lidar)
+    far = np.linalg.norm(a.points_lidar, axis=1) > 2.0
+    assert np.mean(a.ring[far] == b.ring[far]) > 0.999
+    error_ns = np.abs(a.offsets_ns - b.offsets_ns)
+    assert np.quantile(error_ns, 0.99) < 0.01 * 50_000_000
