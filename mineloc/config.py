@@ -55,8 +55,12 @@ class SimulateConfig(Section):
         default=0.0009, ge=0, description="growth of the range noise: metres a metre and tan(incidence)"
     )
     loss: float = Field(default=0.005, ge=0, lt=1, description="share of shots lost by chance")
-    dust: float = Field(default=0.0, ge=0, lt=1, description="share of shots that meet dust")
+    dust: float = Field(default=0.0, ge=0, lt=1, description="share of shots that would meet dust in open space")
     dust_depth_m: float = Field(default=1.5, gt=0, description="mean depth at which dust returns")
+    sweep_loss: float = Field(default=0.0, ge=0, lt=1, description="share of sweeps missing, in runs of three on average")
+    machine: bool = Field(default=False, description="a loader drives ahead of the drone")
+    roadway_width_m: float = Field(default=4.0, ge=1.5, le=30, description="of plans that do not tell (DXF)")
+    roadway_height_m: float = Field(default=3.2, ge=1.8, le=30, description="of plans that do not tell (DXF)")
     imu_hz: float = Field(default=200.0, ge=50, le=1000)
     gyro_noise_degps_rthz: float = Field(default=0.007, ge=0)
     gyro_bias_degps: float = Field(default=0.2, ge=0)
@@ -82,9 +86,40 @@ class KeyframeConfig(Section):
 
 
 class OdometryConfig(Section):
-    """The mineloc front end."""
+    """The mineloc front end. Sigmas are one standard deviation; densities are per root hertz."""
 
-    use_imu: bool = True
+    use_imu: bool = Field(default=True, description="false: constant velocity even if the flight has an IMU")
+    fine_voxel_m: float = Field(default=0.3, ge=0.1, description="edge of the map's finer patches")
+    coarse_voxel_m: float = Field(
+        default=0.9, ge=0.1, description="edge of the patches that stand in for poor fine ones"
+    )
+    sweep_voxel_m: float = Field(default=0.3, gt=0, description="one mean point a voxel is registered")
+    insert_voxel_m: float = Field(default=0.1, gt=0, description="one mean point a voxel goes into the map")
+    patch_points: float = Field(default=200.0, ge=10, description="weight that a fine patch keeps; older points fade")
+    patch_min_points: float = Field(default=5.0, ge=3)
+    patch_growth: float = Field(default=0.2, ge=0, description="share of new points that makes a patch fitted again")
+    max_flatness: float = Field(default=0.05, gt=0, lt=0.34, description="a plane's least eigenvalue over their sum")
+    min_patch_width_m: float = Field(default=0.05, ge=0, description="a plane spreads so far (1 sigma) both ways")
+    point_weight: float = Field(default=0.1, ge=0, description="weight of non-planar residuals against planar ones")
+    range_sigma_m: float = Field(default=0.02, gt=0)
+    angle_sigma_rad: float = Field(default=0.0005, ge=0)
+    surface_sigma_m: float = Field(default=0.01, gt=0, description="what no averaging removes")
+    kernel_sigmas: float = Field(default=3.0, gt=0, description="Geman-McClure kernel")
+    gate_sigmas: float = Field(default=8.0, gt=0)
+    information_share: float = Field(
+        default=0.1, gt=0, le=1, description="neighbouring residuals share their errors: n count as so many n"
+    )
+    rounds: int = Field(default=6, ge=1)
+    forget_after_m: float = Field(default=150.0, gt=0, description="patches not seen for so long a way are dropped")
+    min_matches: int = Field(default=60, ge=6)
+    min_inlier_ratio: float = Field(default=0.25, ge=0, le=1)
+    weak_ratio: float = Field(default=0.005, ge=0, lt=1, description="eigenvalue ratio below which a direction is weak")
+    angular_radps2: float = Field(default=2.0, gt=0, description="acceleration density, flights without an IMU")
+    linear_mps2: float = Field(default=2.0, gt=0, description="acceleration density, flights without an IMU")
+    gyro_radps: float = Field(default=2e-4, gt=0, description="noise density of the gyro")
+    accel_mps2: float = Field(default=0.03, gt=0, description="noise density of the accelerometer with vibration")
+    gyro_walk_radps2: float = Field(default=1e-5, ge=0)
+    accel_walk_mps3: float = Field(default=1e-4, ge=0)
 
 
 class LoamConfig(Section):

@@ -10,21 +10,28 @@ from numpy.typing import NDArray
 
 from mineloc.config import SimulateConfig
 from mineloc.data import Calibration, FlightInfo, ImuSamples, Sweep, Trajectory
-from mineloc.sim.imu import Imu, ImuNoise, lever
-from mineloc.sim.lidar import LidarModel, lidar_model
+from mineloc.errors import SimulationError
 from mineloc.sim.drone import drone_motion
+from mineloc.sim.imu import Imu, ImuNoise, mounting
+from mineloc.sim.lidar import LidarModel, lidar_model
+from mineloc.sim.machine import Machine, in_front
+from mineloc.sim.mine import Mine
 from mineloc.sim.motion import Vibration
 from mineloc.sim.path import fly_line, passable
-from mineloc.sim.roadways import RoadwayGraph
 from mineloc.sim.scene import Scene
-from mineloc.sim.schedule import Limits, Schedule, schedule
-from mineloc.sim.shots import RangeErrors, aim, firings_of, measure
+from mineloc.sim.schedule import Limits, schedule
+from mineloc.sim.shots import RangeErrors, Returns, Shots, aim, firings_of, measure
 from mineloc.sim.tour import plan_tour
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
+Bool = NDArray[np.bool_]
 
 START_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
+TRUTH_NS = 10_000_000
+
+# what a random stream is for
+_TOUR, _SWAY, _VIBRATION, _IMU, _RANGES, _LOSS = range(1, 7)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,12 +39,12 @@ class Packet:
     """What arrives within one revolution of the LiDAR.
 
     Attributes:
-        sweep: one revolution, points in the lidar frame at each point's own time.
+        sweep: one revolution, points in the lidar frame at each point's own time; None if it was lost.
         imu: the samples during that revolution.
         truth: `T_map_body` at 100 Hz during that revolution.
     """
 
-    sweep: Sweep
+    sweep: Sweep | None
     imu: ImuSamples
     truth: Trajectory
 
@@ -45,37 +52,49 @@ class Packet:
 class SimulatedFlight:
     """A flight through a mine that never took place.
 
+    Everything that chance decides has its own generator, seeded by `config.seed` and what it is for: the same
+    configuration gives the same flight, whatever the number of threads.
+
     Args:
-        scene: the mine's surface.
-        graph: its roadways.
+        mine: where.
         config: drone, sensors and noise.
-        site: name of the mine.
+        start: node of the mine's roadway graph to start from; None: an end, by chance.
 
     Raises:
         SimulationError: the mine cannot be flown.
     """
 
-    def __init__(self, scene: Scene, graph: RoadwayGraph, config: SimulateConfig, *, site: str) -> None:
-        self.scene = scene
-        self.graph = graph
+    def __init__(self, mine: Mine, config: SimulateConfig, *, start: int | None = None) -> None:
+        self.mine = mine
         self.config = config
         self.lidar: LidarModel = lidar_model(config.sensor)
         self.calibration = Calibration(
-            T_body_lidar=lever(0.4, 1.5, -0.3, (0.05, 0.0, 0.12)),
-            T_body_imu=lever(-0.5, 0.3, 0.8, (-0.04, 0.03, 0.02)),
+            T_body_lidar=mounting(0.4, 1.5, -0.3, (0.05, 0.0, 0.12)),
+            T_body_imu=mounting(-0.5, 0.3, 0.8, (-0.04, 0.03, 0.02)),
         )
-        tour_rng, sway_rng, shake_rng = (_rng(config.seed, stream) for stream in (1, 2, 3))
-        graph = passable(graph, scene, clearance_m=config.clearance_m)
-        self.tour = plan_tour(graph, config.length_m * 1.1, tour_rng)
-        legs = cut(fly_line(graph, self.tour, scene, clearance_m=config.clearance_m), config.length_m)
+        scene, clearance = mine.scene, config.clearance_m
+        self.graph = passable(mine.graph, scene, clearance_m=clearance)
+        # rounding corners and blind ends shortens the line by some percent
+        self.tour = plan_tour(self.graph, config.length_m * 1.15 + 20.0, _rng(config.seed, _TOUR), start=start)
+        legs = cut(fly_line(self.graph, self.tour, scene, clearance_m=clearance), config.length_m)
+        check_enclosed(scene, legs[0])
         limits = Limits(config.speed_mps, config.accel_mps2, np.deg2rad(config.yaw_rate_degps), config.hover_s)
-        self.plan = schedule(legs, limits)
-        vibration = Vibration.of_rotors(config.vibration_mps2, np.deg2rad(config.vibration_degps), shake_rng)
-        self.motion = drone_motion(self.plan, scene, vibration, sway_m=config.sway_m, clearance_m=config.clearance_m, rng=sway_rng)
+        vibration = Vibration.of_rotors(
+            config.vibration_mps2, np.deg2rad(config.vibration_degps), _rng(config.seed, _VIBRATION)
+        )
+        self.motion = drone_motion(
+            schedule(legs, limits),
+            scene,
+            vibration,
+            sway_m=config.sway_m,
+            clearance_m=clearance,
+            rng=_rng(config.seed, _SWAY),
+        )
+        self.machine = Machine(self.motion, scene) if config.machine else None
         self.sweeps = int(self.motion.end_s * config.lidar_hz) - 1
         self.info = FlightInfo(
-            flight=f"{site}-{config.seed}",
-            site=site,
+            flight=f"{mine.name}-{config.seed}",
+            site=mine.name,
             drone="simulated multirotor",
             lidar=self.lidar.name,
             imu=f"simulated MEMS {config.imu_hz:g} Hz",
@@ -86,74 +105,117 @@ class SimulatedFlight:
 
     def pose(self, stamps_ns: I64) -> F64:
         """(n, 4, 4) true `T_map_body` at any times of the flight."""
-        return self.motion.pose(self._seconds(stamps_ns))
+        return self.motion.pose((stamps_ns - START_NS) * 1e-9)
 
     def packets(self) -> Iterator[Packet]:
         """The flight, one revolution after the other; the same every time it is asked for."""
         config = self.config
-        noise = ImuNoise(
-            gyro_density=np.deg2rad(config.gyro_noise_degps_rthz),
-            gyro_bias_radps=np.deg2rad(config.gyro_bias_degps),
-            gyro_walk=np.deg2rad(config.gyro_walk_degps2_rthz),
-            accel_density=config.accel_noise_mps2_rthz,
-            accel_bias_mps2=config.accel_bias_mps2,
-            accel_walk=config.accel_walk_mps3_rthz,
-        )
         imu = Imu(
-            self.motion, self.calibration.T_body_imu, noise, rate_hz=config.imu_hz, start_ns=START_NS, rng=_rng(config.seed, 4)
+            self.motion,
+            self.calibration.T_body_imu,
+            _imu_noise(config),
+            rate_hz=config.imu_hz,
+            start_ns=START_NS,
+            rng=_rng(config.seed, _IMU),
         )
+        lost = missing(self.sweeps, config.sweep_loss, _rng(config.seed, _LOSS))
         period_ns = round(1e9 / config.lidar_hz)
         for revolution in range(self.sweeps):
-            end_ns = START_NS + (revolution + 1) * period_ns
-            stamps = np.arange(-(-revolution * period_ns // 10_000_000), -(-(revolution + 1) * period_ns // 10_000_000))
-            stamps = START_NS + stamps * 10_000_000
-            yield Packet(self._sweep(revolution), imu.until(end_ns), Trajectory(stamps, self.pose(stamps)))
+            first, last = (-(-(revolution + k) * period_ns // TRUTH_NS) for k in range(2))
+            stamps = START_NS + np.arange(first, last, dtype=np.int64) * TRUTH_NS
+            yield Packet(
+                None if lost[revolution] else self.sweep(revolution),
+                imu.until(START_NS + (revolution + 1) * period_ns),
+                Trajectory(stamps, self.pose(stamps)),
+            )
 
-    def _seconds(self, stamps_ns: I64) -> F64:
-        return (stamps_ns - START_NS) * 1e-9
+    def sweep(self, revolution: int) -> Sweep:
+        """One revolution of the LiDAR, counted from 0."""
+        config, lidar = self.config, self.lidar
+        firings = firings_of(lidar, revolution, config.lidar_hz)
+        after = firings.time_s[-1] + lidar.firing_period_s(config.lidar_hz)
+        poses = self.motion.pose(np.append(firings.time_s, after)) @ self.calibration.T_body_lidar
+        poses[:, :3, 3] -= self.mine.scene.origin_m
+        shots = aim(lidar, firings, poses, config.lidar_hz)
+        hits = self.mine.scene.cast(shots.rays)
+        place = self.machine.pose(float(firings.time_s[0])) if self.machine else None
+        if place is not None:
+            place[:3, 3] -= self.mine.scene.origin_m
+            hits = in_front(hits, shots.rays, place)
+        errors = RangeErrors(lidar.sigma_m, config.grazing_noise, config.loss, config.dust, config.dust_depth_m)
+        returns = measure(lidar, shots, hits, errors, _rng(config.seed, _RANGES, revolution))
+        return _as_sweep(shots, returns, START_NS + round(firings.time_s[0] * 1e9), round(1e9 / config.lidar_hz))
 
-    def _sweep(self, revolution: int) -> Sweep:
-        config = self.config
-        firings = firings_of(self.lidar, revolution, config.lidar_hz)
-        period = self.lidar.firing_period_s(config.lidar_hz)
-        poses = self.motion.pose(np.append(firings.time_s, firings.time_s[-1] + period)) @ self.calibration.T_body_lidar
-        poses[:, :3, 3] -= self.scene.origin_m
-        shots = aim(self.lidar, firings, poses, config.lidar_hz)
-        hits = self.scene.cast(shots.rays)
-        errors = RangeErrors(
-            self.lidar.sigma_m, config.grazing_noise, config.loss, config.dust, config.dust_depth_m
-        )
-        returns = measure(self.lidar, shots, hits.range_m, hits.normals, errors, _rng(config.seed, 5, revolution))
-        seen = returns.seen
-        points = shots.origins_lidar[seen] + returns.range_m[seen, None] * shots.directions_lidar[seen]
-        offsets = shots.offsets_ns[seen]
-        # stamp_ns is the first point that came back, not the first shot
-        first = int(offsets[0]) if len(offsets) else 0
-        return Sweep(
-            stamp_ns=START_NS + round(firings.time_s[0] * 1e9) + first,
-            points_lidar=points.astype(np.float32),
-            offsets_ns=offsets - first,
-            ring=shots.ring[seen],
-            intensity=returns.intensity[seen],
-            period_ns=round(1e9 / config.lidar_hz),
-        )
+
+def _as_sweep(shots: Shots, returns: Returns, start_ns: int, period_ns: int) -> Sweep:
+    seen = returns.seen
+    offsets = shots.offsets_ns[seen]
+    # stamp_ns is the first point that came back, not the first shot
+    first = int(offsets[0]) if len(offsets) else 0
+    points = shots.origins_lidar[seen] + returns.range_m[seen, None] * shots.directions_lidar[seen]
+    return Sweep(
+        stamp_ns=start_ns + first,
+        points_lidar=points.astype(np.float32),
+        offsets_ns=offsets - first,
+        ring=shots.ring[seen],
+        intensity=returns.intensity[seen],
+        period_ns=period_ns,
+    )
 
 
 def _rng(*key: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(key))
 
 
+def _imu_noise(config: SimulateConfig) -> ImuNoise:
+    return ImuNoise(
+        gyro_density=np.deg2rad(config.gyro_noise_degps_rthz),
+        gyro_bias_radps=np.deg2rad(config.gyro_bias_degps),
+        gyro_walk=np.deg2rad(config.gyro_walk_degps2_rthz),
+        accel_density=config.accel_noise_mps2_rthz,
+        accel_bias_mps2=config.accel_bias_mps2,
+        accel_walk=config.accel_walk_mps3_rthz,
+    )
+
+
+def missing(sweeps: int, share: float, rng: np.random.Generator) -> Bool:
+    """(n,) which sweeps are lost: runs of three on average (a two-state chain), the first never."""
+    leave = 1.0 / 3.0
+    enter = min(leave * share / (1.0 - share), 1.0)
+    chance = rng.random(sweeps)
+    out = np.zeros(sweeps, np.bool_)
+    for i in range(1, sweeps):
+        out[i] = chance[i] >= leave if out[i - 1] else chance[i] < enter
+    return out
+
+
+def check_enclosed(scene: Scene, line_m: F64) -> None:
+    """Refuse a mine of which the LiDAR would see little.
+
+    Raises:
+        SimulationError: more than half of all directions along the line meet nothing.
+    """
+    angle = np.linspace(0, 2 * np.pi, 36, endpoint=False)
+    around = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(36)])
+    points = line_m[:: max(1, len(line_m) // 50)]
+    origins = np.repeat(points, len(around), axis=0)
+    met = np.isfinite(scene.ranges_m(origins, np.tile(around, (len(points), 1)))).mean()
+    if met < 0.5:
+        raise SimulationError(
+            "mine", f"open in {1 - met:.0%} of all directions", expected="walls around the roadways", todo="check the mesh"
+        )
+
+
 def cut(legs: list[F64], length_m: float) -> list[F64]:
-    """The first `length_m` metres of the legs."""
+    """The first `length_m` metres of the legs; a last piece under a metre is left out."""
     out: list[F64] = []
     left = length_m
     for leg in legs:
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(leg, axis=0), axis=1))])
         count = int(np.searchsorted(along, left))
-        if count > 10:
-            out.append(leg[:count])
+        if count > 10 or not out:
+            out.append(leg[: max(count, 2)])
         left -= along[-1]
         if left <= 0:
             break
     return out
-

@@ -23,19 +23,26 @@ SPUR_M = 1.5
 SMALLEST_LOOP_M = 12.0
 SMALLEST_BLIND_LOOP_M = 20.0
 SHORTEST_MINE_M = 10.0
+HIGHEST_ROADWAY_M = 60.0
+SAMPLES = 300
+MOST_CELLS = 4e8
 
 
-def roadways_of_mesh(scene: Scene, low_m: F64, high_m: F64, *, cell_m: float = 0.2) -> RoadwayGraph:
+def roadways_of_mesh(
+    scene: Scene, low_m: F64, high_m: F64, *, cell_m: float = 0.2, where: str = "mine"
+) -> RoadwayGraph:
     """Find the roadways of a mesh: the largest connected part of its free space, as centre-lines on the floor.
 
     Args:
         scene: the mesh.
         low_m, high_m: (3,) its bounds.
         cell_m: resolution of the plan.
+        where: the mine's file, for messages.
 
     Raises:
-        SimulationError: no roadway in it.
+        SimulationError: no roadway in it, or a size that only a wrong unit can give.
     """
+    _check_scale(scene, low_m, high_m, cell_m, where)
     sheet = free_sheet(scene, low_m, high_m, cell_m=cell_m)
     if len(sheet):
         part = components(sheet.links)
@@ -47,12 +54,36 @@ def roadways_of_mesh(scene: Scene, low_m: F64, high_m: F64, *, cell_m: float = 0
     graph = net.graph()
     if graph.length_m < SHORTEST_MINE_M:
         raise SimulationError(
-            "mine",
+            where,
             f"{graph.length_m:.0f} m of roadway between floors and roofs",
             expected=f"at least {SHORTEST_MINE_M:.0f} m, metres, z up, headroom over 1.5 m",
             todo="check the mesh's unit and that it has both floor and roof",
         )
     return graph
+
+
+def _check_scale(scene: Scene, low_m: F64, high_m: F64, cell_m: float, where: str) -> None:
+    """Refuse before the fine grid: gaps as high as a tower mean centimetres, and no memory holds the plan of a county."""
+    columns, rows = np.meshgrid(*(np.linspace(low_m[k], high_m[k], SAMPLES + 2)[1:-1] for k in range(2)))
+    start = np.column_stack([columns.ravel(), rows.ravel(), np.full(columns.size, low_m[2] - 1.0)])
+    crossings = scene.verticals(start)
+    gaps = np.diff(crossings.height_m)[np.diff(crossings.ray) == 0]
+    gaps = gaps[gaps > 0.1]
+    if len(gaps) and np.median(gaps) > HIGHEST_ROADWAY_M:
+        raise SimulationError(
+            where,
+            f"half of the roof is over {np.median(gaps):.0f} m above the floor",
+            expected=f"less than {HIGHEST_ROADWAY_M:.0f} m",
+            todo="is the unit centimetres or millimetres? scale it to metres",
+        )
+    cells = float(np.prod((high_m - low_m)[:2])) / cell_m**2
+    if cells > MOST_CELLS:
+        raise SimulationError(
+            where,
+            f"a plan of {cells * cell_m**2 / 1e6:.1f} km²",
+            expected=f"at most {MOST_CELLS * cell_m**2 / 1e6:.0f} km²",
+            todo="give the roadways with --graph, or cut the mesh",
+        )
 
 
 @dataclass(slots=True, eq=False)
@@ -106,18 +137,20 @@ class _Net:
         self._keep_largest()
 
     def _prune(self) -> bool:
-        """Remove the shortest dead end that is only a corner or a bump of the wall."""
+        """Remove dead ends that are only a corner or a bump of the wall, the shortest first, one a junction a time."""
         degree = self._degrees()
-        spurs: list[tuple[float, int]] = []
+        spurs: list[tuple[float, int, int]] = []
         for index, edge in enumerate(self.edges):
             for end, root in ((edge.a, edge.b), (edge.b, edge.a)):
                 limit = SPUR_FACTOR * self.room[root] + SPUR_M
                 if degree[end] == 1 and degree[root] >= 3 and edge.length_m < limit:
-                    spurs.append((edge.length_m - limit, index))
-        if not spurs:
-            return False
-        del self.edges[min(spurs)[1]]
-        return True
+                    spurs.append((edge.length_m - limit, index, root))
+        gone: dict[int, int] = {}
+        for _, index, root in sorted(spurs):
+            gone.setdefault(root, index)
+        dropped = set(gone.values())
+        self.edges = [edge for index, edge in enumerate(self.edges) if index not in dropped]
+        return bool(dropped)
 
     def _contract(self) -> bool:
         """Join two junctions that lie within one another's room: together they are one intersection."""
@@ -155,25 +188,28 @@ class _Net:
         return False
 
     def _dissolve(self) -> bool:
-        """Join the two roadways of a node where nothing else ends."""
-        degree = self._degrees()
-        for node, count in degree.items():
-            ends = [edge for edge in self.edges if node in (edge.a, edge.b)]
-            if count == 2 and len(ends) == 2:
-                first, second = ends
-                first = first if first.b == node else first.reversed()
-                second = second if second.a == node else second.reversed()
-                self.edges = [edge for edge in self.edges if edge not in ends]
-                self.edges.append(
-                    _Edge(
-                        first.a,
-                        second.b,
-                        np.concatenate([first.line_m, second.line_m[1:]]),
-                        np.concatenate([first.clearance_m, second.clearance_m[1:]]),
-                    )
-                )
-                return True
-        return False
+        """Join the two roadways of every node where nothing else ends."""
+        at: dict[int, list[_Edge]] = {}
+        for edge in self.edges:
+            at.setdefault(edge.a, []).append(edge)
+            at.setdefault(edge.b, []).append(edge)
+        changed = False
+        for node in sorted(at):
+            ends = at[node]
+            if len(ends) != 2 or ends[0] is ends[1]:
+                continue
+            first, second = ends
+            head = first if first.b == node else first.reversed()
+            tail = second if second.a == node else second.reversed()
+            line = np.concatenate([head.line_m, tail.line_m[1:]])
+            joined = _Edge(head.a, tail.b, line, np.concatenate([head.clearance_m, tail.clearance_m[1:]]))
+            for other, old in ((joined.a, first), (joined.b, second)):
+                at[other] = [joined if edge is old else edge for edge in at[other]]
+            at[node] = []
+            changed = True
+        if changed:
+            self.edges = list({id(edge): edge for node in sorted(at) for edge in at[node]}.values())
+        return changed
 
     def _keep_largest(self) -> None:
         """Ledges and slivers of the sheet can leave pieces that hang together with nothing else."""

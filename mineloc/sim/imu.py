@@ -96,7 +96,7 @@ class Imu:
         return bias + self._rng.standard_normal((count, 6)) * density
 
 
-def lever(roll_deg: float, pitch_deg: float, yaw_deg: float, offset_m: tuple[float, float, float]) -> F64:
+def mounting(roll_deg: float, pitch_deg: float, yaw_deg: float, offset_m: tuple[float, float, float]) -> F64:
     """(4, 4) place of a sensor on the body from its offset and its small mounting angles."""
     rotvec = np.deg2rad([roll_deg, pitch_deg, yaw_deg])
     T = se3.exp(np.concatenate([rotvec, np.zeros(3)]))

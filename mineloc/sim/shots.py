@@ -9,6 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mineloc.sim.lidar import LidarModel
+from mineloc.sim.scene import Hits
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -167,7 +168,7 @@ class Returns:
 
 
 def measure(
-    lidar: LidarModel, shots: Shots, true_range_m: F32, normals: F32, errors: RangeErrors, rng: np.random.Generator
+    lidar: LidarModel, shots: Shots, hits: Hits, errors: RangeErrors, rng: np.random.Generator
 ) -> Returns:
     """Ranges with noise, quantisation and drop-outs.
 
@@ -178,18 +179,17 @@ def measure(
     Args:
         lidar: the sensor.
         shots: where it aimed.
-        true_range_m: (n,) float32, infinite where nothing was met.
-        normals: (n, 3) of the surfaces met.
+        hits: what the rays met.
         errors: of the measurement.
         rng: noise and chance.
     """
-    n = len(true_range_m)
+    n = len(hits.range_m)
     noise = rng.standard_normal(n, dtype=np.float32)
     chance = rng.random((3, n), dtype=np.float32)
     seen, ranges, intensity = _measure(
         shots.rays,
-        true_range_m,
-        normals,
+        hits.range_m,
+        hits.normals,
         noise,
         chance,
         (errors.sigma_m, errors.grazing, errors.loss, errors.dust, errors.dust_depth_m),
