@@ -70,7 +70,7 @@ def log(T: F64) -> F64:
     flat = T.reshape(-1, 4, 4)
     phi = Rotation.from_matrix(flat[:, :3, :3]).as_rotvec()
     rho = np.linalg.solve(_left_jacobian_so3(phi), flat[:, :3, 3, None])[..., 0]
-    return np.concatenate([phi, rho], axis=1).reshape(*T.shape[:-2], 6)
+    return np.concatenate([phi, np.asarray(rho, dtype=np.float64)], axis=1).reshape(*T.shape[:-2], 6)
 
 
 def adjoint(T: F64) -> F64:

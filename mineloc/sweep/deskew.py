@@ -13,10 +13,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from mineloc import se3
+from mineloc.compiled import njit
 from mineloc.data import F32, F64, I64, Sweep
 
 KNOT_NS = 500_000

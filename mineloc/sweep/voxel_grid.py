@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from mineloc.compiled import njit
 from mineloc.data import F32, F64, I64
 
 REACH = 1 << 20

@@ -1,0 +1,230 @@
+"""The mineloc front end: LiDAR odometry, inertial where there is an IMU, for roadways that look alike along their axis.
+
+What METHOD part 7 knows, in one filter: patches at fine voxels, planar and non-planar residuals blended, the motion
+prior inside the solve, gravity through the accelerometer, a robust kernel, and information that tells weak directions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mineloc import se3
+from mineloc.config import KeyframeConfig, OdometryConfig
+from mineloc.data import F32, F64, Calibration, Degeneracy, ImuSamples, Keyframe, OdometryStep, RelativePose, Sweep
+from mineloc.errors import FlightError
+from mineloc.odometry.constant_velocity import ConstantVelocity
+from mineloc.odometry.imu_motion import GRAVITY_MPS2, ImuMotion, ImuNoise
+from mineloc.odometry.information import EdgeNoise, degeneracy_of, edge_information
+from mineloc.odometry.keyframes import KeyframeSelector
+from mineloc.odometry.motion import BodyPath, MotionModel
+from mineloc.odometry.registration import Linearised, Weighting, linearise
+from mineloc.odometry.voxel_map import VoxelMap
+from mineloc.sweep.deskew import transform_between_knots
+from mineloc.sweep.voxel_grid import mean_by_label, number_voxels, voxel_centroids
+
+MIN_IMU_SAMPLES = 5
+IMU_GRACE_SWEEPS = 20
+"""An IMU that starts so many sweeps late is still taken; the map starts anew then."""
+FORGET_EVERY = 100
+_CONVERGED_RAD, _CONVERGED_M = 2e-5, 2e-4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Registered:
+    last: Linearised | None
+    hessian_lidar: F64
+    points: int
+
+    @property
+    def matches(self) -> int:
+        return 0 if self.last is None else self.last.planar + self.last.other
+
+    @property
+    def inlier_ratio(self) -> float:
+        return self.matches / self.points if self.points else float("nan")
+
+
+class MinelocFrontEnd:
+    """`FrontEnd` for every method but the baselines.
+
+    The odom frame's origin is the body at the first sweep; with an IMU its z axis is up. Poses are true for the time of
+    a sweep's last point.
+
+    Args:
+        config, keyframes: thresholds and noise.
+        calibration: where the IMU sits against the LiDAR.
+    """
+
+    def __init__(self, config: OdometryConfig, keyframes: KeyframeConfig, calibration: Calibration) -> None:
+        self._config, self._keyframe_config = config, keyframes
+        self._selector = KeyframeSelector(keyframes)
+        self._weighting = Weighting.of(config)
+        self._T_lidar_imu = calibration.T_lidar_imu
+        self._T_body_lidar: F64 = np.eye(4)
+        self._motion: MotionModel | None = None
+        self._maps = self._new_maps()
+        self._sweeps = 0
+        self._flown_m = 0.0
+        self._coasted_s = 0.0
+
+    def step(self, sweep: Sweep, imu: ImuSamples) -> OdometryStep:
+        """Deskew by the predicted motion, register to the patches inside the motion prior, grow the map.
+
+        Raises:
+            FlightError: the sweep is not later than the one before; an IMU that does not measure gravity.
+        """
+        motion = self._started(sweep, imu)
+        before = motion.stamp_ns, motion.T_odom_body
+        path = motion.predict(sweep.stamp_ns, sweep.end_ns)
+        cloud = self._deskewed(sweep, path)
+        registered = self._register(motion, cloud)
+        reason = self._doubt(registered)
+        self._coasted_s += (motion.stamp_ns - before[0]) * 1e-9 if reason else 0.0
+        self._flown_m += float(np.linalg.norm(motion.T_odom_body[:3, 3] - before[1][:3, 3]))
+        self._grow_map(motion, cloud)
+        self._sweeps += 1
+        return self._told(motion, cloud, registered, reason)
+
+    def _started(self, sweep: Sweep, imu: ImuSamples) -> MotionModel:
+        """The motion model, made at the first sweep, or anew when an IMU begins a little late."""
+        c, motion = self._config, self._motion
+        if motion is not None and sweep.end_ns <= motion.stamp_ns:
+            raise FlightError(
+                "odometry",
+                f"a sweep ends at {sweep.end_ns} ns, not after the one before ({motion.stamp_ns} ns)",
+                expected="time going forwards",
+                todo="ingest the recording again: it names and drops such sweeps",
+            )
+        late = isinstance(motion, ConstantVelocity) and self._sweeps <= IMU_GRACE_SWEEPS
+        if c.use_imu and len(imu) >= MIN_IMU_SAMPLES and (motion is None or late):
+            motion = self._start_imu(sweep, imu, motion)
+        elif motion is None:
+            motion = ConstantVelocity(sweep.stamp_ns - 1, angular_radps2=c.angular_radps2, linear_mps2=c.linear_mps2)
+        if isinstance(motion, ImuMotion):
+            motion.feed(imu)
+        self._motion = motion
+        return motion
+
+    def _start_imu(self, sweep: Sweep, imu: ImuSamples, before: MotionModel | None) -> ImuMotion:
+        c = self._config
+        force = float(np.linalg.norm(imu.accel_mps2.mean(axis=0)))
+        if not 0.7 * GRAVITY_MPS2 < force < 1.3 * GRAVITY_MPS2:
+            raise FlightError(
+                "odometry",
+                f"the IMU's mean specific force is {force:.2f}",
+                expected="about 9.81 m/s² (gravity)",
+                todo="check its unit (g instead of m/s²?) in the sequence file, or --set odometry.use_imu=false",
+            )
+        noise = ImuNoise(c.gyro_radps, c.accel_mps2, c.gyro_walk_radps2, c.accel_walk_mps3)
+        # the state begins just before the sweep; a late start keeps heading and place, but not the unlevelled map
+        start_ns = sweep.stamp_ns - 1 if before is None else max(before.stamp_ns, sweep.stamp_ns - 1)
+        T = None if before is None else before.T_odom_body @ self._T_lidar_imu
+        self._T_body_lidar = se3.inverse(self._T_lidar_imu)
+        self._maps = self._new_maps()
+        return ImuMotion(start_ns, imu, noise=noise, T_odom_body=T)
+
+    def _deskewed(self, sweep: Sweep, path: BodyPath) -> F32:
+        """(n, 3) lidar points as if all were measured at the sweep's end."""
+        T_odom_lidar = path.poses @ self._T_body_lidar
+        T_end_lidar = np.ascontiguousarray((se3.inverse(T_odom_lidar[-1]) @ T_odom_lidar)[:, :3])
+        offsets_ns = np.zeros(len(sweep), np.int64) if sweep.offsets_ns is None else sweep.offsets_ns
+        return transform_between_knots(sweep.points_lidar, offsets_ns, path.stamps_ns - sweep.stamp_ns, T_end_lidar)
+
+    def _register(self, motion: MotionModel, cloud: F32) -> _Registered:
+        """Gauss-Newton on prior and residuals together; without a map or points the prediction stands."""
+        _, label, count = number_voxels(cloud, 1.0 / self._config.sweep_voxel_m)
+        ranges = np.bincount(label, minlength=count).astype(np.float64)
+        points_body = se3.apply(self._T_body_lidar, mean_by_label(cloud, label, count))
+        if not len(self._maps[0]) or not count:
+            return _Registered(None, np.zeros((6, 6)), count)
+        prior = np.asarray(np.linalg.inv(motion.covariance), dtype=np.float64)
+        share, rounds = self._config.information_share, self._config.rounds
+        while True:
+            last = linearise(points_body, ranges, motion.T_odom_body, self._maps, self._weighting)
+            information, gradient = prior.copy(), prior @ motion.deviation()
+            information[:6, :6] += share * last.H
+            gradient[:6] += share * last.b
+            error = -np.asarray(np.linalg.solve(information, gradient), dtype=np.float64)
+            motion.add(error)
+            rounds -= 1
+            if rounds == 0 or (np.abs(error[:3]).max() < _CONVERGED_RAD and np.abs(error[3:6]).max() < _CONVERGED_M):
+                break
+        motion.covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
+        return _Registered(last, self._in_lidar(last.H, motion.T_odom_body), count)
+
+    def _in_lidar(self, H: F64, T_odom_body: F64) -> F64:
+        """The Hessian of [rotation (body), position (odom)] as one of a right perturbation of the lidar pose."""
+        to_body = np.eye(6)
+        to_body[3:, 3:] = T_odom_body[:3, :3]
+        A = to_body @ se3.adjoint(self._T_body_lidar)
+        return A.T @ H @ A
+
+    def _doubt(self, registered: _Registered) -> str:
+        """Why a pose rests on the motion prior alone; empty if it does not."""
+        c = self._config
+        if self._sweeps == 0:
+            return "" if registered.points else "the sweep has no points"
+        if registered.matches < c.min_matches:
+            return f"{registered.matches} matches, at least {c.min_matches} needed"
+        if registered.inlier_ratio < c.min_inlier_ratio:
+            return f"inlier ratio {registered.inlier_ratio:.2f}, at least {c.min_inlier_ratio} needed"
+        return ""
+
+    def _grow_map(self, motion: MotionModel, cloud: F32) -> None:
+        if len(cloud):
+            thin = voxel_centroids(cloud, self._config.insert_voxel_m)
+            points = se3.apply(motion.T_odom_body @ self._T_body_lidar, thin)
+            for patches in self._maps:
+                patches.insert(points, now=self._flown_m)
+        if self._sweeps % FORGET_EVERY == FORGET_EVERY - 1:
+            for patches in self._maps:
+                patches.forget(self._flown_m - self._config.forget_after_m)
+
+    def _told(self, motion: MotionModel, cloud: F32, registered: _Registered, reason: str) -> OdometryStep:
+        T_odom_lidar = motion.T_odom_body @ self._T_body_lidar
+        last = registered.last
+        degeneracy = None
+        if last is not None:
+            degeneracy = degeneracy_of(registered.hessian_lidar, registered.matches, weak_ratio=self._config.weak_ratio)
+        keyframe, edge = None, None
+        if len(cloud) and self._selector.consider(motion.stamp_ns, T_odom_lidar):
+            keyframe = self._keyframe(motion, cloud, T_odom_lidar)
+            edge = self._edge(registered, degeneracy)
+            self._coasted_s = 0.0
+        return OdometryStep(
+            stamp_ns=motion.stamp_ns,
+            T_odom_lidar=T_odom_lidar,
+            trusted=not reason,
+            reason=reason,
+            keyframe=keyframe,
+            relative_pose=edge,
+            degeneracy=degeneracy,
+            inlier_ratio=registered.inlier_ratio,
+            residual_m=float("nan") if last is None else last.residual_m,
+            points_used=registered.points,
+        )
+
+    def _keyframe(self, motion: MotionModel, cloud: F32, T_odom_lidar: F64) -> Keyframe:
+        up = T_odom_lidar[2, :3].copy() if isinstance(motion, ImuMotion) else None
+        points = voxel_centroids(cloud, self._keyframe_config.voxel_m)
+        return Keyframe(self._selector.index, motion.stamp_ns, T_odom_lidar, points, up)
+
+    def _edge(self, registered: _Registered, degeneracy: Degeneracy | None) -> RelativePose | None:
+        T_i_j, j = self._selector.T_before_last, self._selector.index
+        if T_i_j is None:
+            return None
+        # the registration's rows are weighted by their own variances already: σ enters as 1/√2, that 2σ² is 1
+        noise = EdgeNoise(sigma_m=float(np.sqrt(0.5)), correlation=1.0 / self._config.information_share)
+        judged = degeneracy or degeneracy_of(registered.hessian_lidar, 0)
+        information = edge_information(registered.hessian_lidar, judged, noise=noise, coasted_s=self._coasted_s)
+        return RelativePose(j - 1, j, T_i_j, information)
+
+    def _new_maps(self) -> tuple[VoxelMap, VoxelMap]:
+        c = self._config
+        fine = VoxelMap(c.fine_voxel_m, cap=c.patch_points, min_weight=c.patch_min_points, growth=c.patch_growth)
+        # the share of a patch that is new falls with its area: the coarse ones keep more
+        cap = c.patch_points * max(1.0, (c.coarse_voxel_m / c.fine_voxel_m) ** 2)
+        coarse = VoxelMap(c.coarse_voxel_m, cap=cap, min_weight=c.patch_min_points, growth=c.patch_growth)
+        return fine, coarse
