@@ -169,7 +169,7 @@ class GraphConfig(Section):
     relative_max_m: float = Field(default=3.0, gt=0, description="no motion between keyframes is known less")
     relative_max_deg: float = Field(default=20.0, gt=0, description="no motion between keyframes is known less")
     robust: bool = Field(default=True, description="Cauchy kernel on fixes and loops")
-    cauchy_k: float = Field(default=1.0, gt=0, description="in standard deviations")
+    cauchy_k: float = Field(default=1.0, gt=0, description="in standard deviations of a residual component")
     max_iterations: int = Field(default=100, ge=1)
     relinearize_threshold: float = Field(default=0.05, gt=0, description="metres or radians; causal estimate")
 
