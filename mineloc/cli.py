@@ -24,11 +24,72 @@ app = typer.Typer(
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file of configuration keys.")]
 SetOption = Annotated[list[str] | None, typer.Option("--set", help="Override one key: section.key=value. Repeatable.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable results on stdout; all else on stderr.")]
+LocalOption = Annotated[bool, typer.Option("--local", help="Without Prefect.")]
+ServerOption = Annotated[str | None, typer.Option("--server", help="Address of a running Prefect server.")]
 
 
 @app.callback()
 def _root() -> None:  # pyright: ignore[reportUnusedFunction]  # typer keeps subcommands even if there is only one
     pass
+
+
+@app.command()
+def simulate(
+    mine: Annotated[str, typer.Argument(help="Mesh (.ply .obj .stl .dae), plan (.toml .dxf), or demo, straight, loop.")],
+    out: Annotated[Path, typer.Option("--out", help="The flight file to write (.mcap).")],
+    length_m: Annotated[float | None, typer.Option("--length-m", help="Path length of the tour.")] = None,
+    speed_mps: Annotated[float | None, typer.Option("--speed-mps", help="On straight roadways.")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Of the tour and of all noise.")] = None,
+    sensor: Annotated[Literal["vlp16", "rs16", "hdl32e", "os0"] | None, typer.Option("--sensor")] = None,
+    start: Annotated[int | None, typer.Option("--start", help="Node of the roadway graph to start from.")] = None,
+    graph: Annotated[Path | None, typer.Option("--graph", help="Roadways of a mesh as JSON; else found in it.")] = None,
+    as_json: JsonOption = False,
+    config: ConfigOption = None,
+    overrides: SetOption = None,
+) -> None:
+    """Fly a made-up drone through a mine: LiDAR with motion distortion, IMU, and the truth."""
+    from mineloc.config import load_config
+    from mineloc.stages.progress_bar import progress_bar
+    from mineloc.stages.simulate import simulate as run_stage
+
+    options = {"length_m": length_m, "speed_mps": speed_mps, "seed": seed, "sensor": sensor}
+    given = [f"simulate.{key}={value}" for key, value in options.items() if value is not None]
+    settings = load_config(config, [*(overrides or ()), *given])
+    with progress_bar("simulate") as progress:
+        result = run_stage(mine, out=out, graph=graph, start=start, config=settings, progress=progress)
+    if as_json:
+        sys.stdout.write(json.dumps(result.to_dict(), indent=1) + "\n")
+        return
+    from rich.console import Console
+
+    from mineloc.stages.simulation_table import simulation_table
+
+    Console(highlight=False).print(simulation_table(result))
+
+
+@app.command()
+def localize(
+    flight: Annotated[Path, typer.Argument(help="A canonical flight (of ingest or simulate).")],
+    method: Annotated[str, typer.Option("--method", help="odometry or loam.")],
+    out: Annotated[Path, typer.Option("--out", help="The run folder to write.")],
+    as_json: JsonOption = False,
+    config: ConfigOption = None,
+    overrides: SetOption = None,
+) -> None:
+    """Where the drone was: trajectories, keyframes, and how sure that is."""
+    from mineloc.config import load_config
+    from mineloc.stages.localize import localize as run_stage
+    from mineloc.stages.progress_bar import progress_bar
+
+    settings = load_config(config, overrides or ())
+    with progress_bar("localize") as progress:
+        result = run_stage(flight, out, method=method, config=settings, progress=progress)
+    if as_json:
+        sys.stdout.write(json.dumps(result.to_dict(), indent=1) + "\n")
+        return
+    from rich.console import Console
+
+    Console(highlight=False).print(result.summary(), soft_wrap=True, markup=False)
 
 
 @app.command()
@@ -63,6 +124,47 @@ def evaluate(
         console.print(line, soft_wrap=True, markup=False)
     for table in tables(evaluation):
         console.print(table)
+
+
+@app.command()
+def run(
+    survey: Annotated[Path, typer.Argument(help="survey.toml: the flights and what is done with them.")],
+    out: Annotated[Path | None, typer.Option("--out", help="Folder of the results, over the file's own word.")] = None,
+    local: LocalOption = False,
+    server: ServerOption = None,
+    as_json: JsonOption = False,
+    overrides: SetOption = None,
+) -> None:
+    """All stages of all flights of a survey, each executed once; as one Prefect flow."""
+    _survey(survey, out, local=local, server=server, as_json=as_json, overrides=overrides)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option("--out", help="Folder of the results.")] = Path("demo"),
+    local: LocalOption = False,
+    server: ServerOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """A mapping flight and an inspection through a built-in mine, from raw recording to accuracy report."""
+    from mineloc.survey.demo import write_demo
+
+    _survey(write_demo(out), out, local=local, server=server, as_json=as_json, overrides=None)
+
+
+def _survey(
+    survey: Path, out: Path | None, *, local: bool, server: str | None, as_json: bool, overrides: list[str] | None
+) -> None:
+    from rich.console import Console
+
+    from mineloc.survey.run import run_survey
+
+    if local and server is not None:
+        raise typer.BadParameter("either --local or --server")
+    console = Console(stderr=as_json, highlight=False)
+    rows = run_survey(survey, console, out=out, overrides=overrides or (), local=local, server=server)
+    if as_json:
+        sys.stdout.write(json.dumps(rows, indent=1, allow_nan=False) + "\n")
 
 
 def main() -> None:

@@ -48,6 +48,18 @@ class LocalizeResult:
     sweeps_per_s: float
     real_time_factor: float
 
+    def to_dict(self) -> dict[str, Any]:
+        """For `--json`."""
+        return {**asdict(self), "out": str(self.out)}
+
+    def summary(self) -> str:
+        """Two lines for people."""
+        doubt = f"{self.untrusted} sweeps rest on the motion prior alone, {self.degenerate} are weak in a direction"
+        return (
+            f"{self.out}: {self.sweeps} sweeps, {self.keyframes} keyframes, {self.path_m:.1f} m; {doubt}\n"
+            f"{self.sweeps_per_s:.1f} sweeps/s, {self.real_time_factor:.1f} times real time"
+        )
+
 
 def localize(
     flight: Path, out: Path, *, method: str, config: Config | None = None, progress: Progress = quiet
