@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import logging
 import os
 import signal
 import sys
@@ -35,7 +36,9 @@ def main() -> int:
     except KeyboardInterrupt:
         return 130
     except Exception as error:  # noqa: BLE001  # the user gets one line, the log the rest
-        return _fail(given.events, SurveyError("flow", f"the program failed ({error!r})", todo="see its log"))
+        log = given.out / ".mineloc" / "logs" / "flow.log"
+        what = f"the program failed ({error!r})"
+        return _fail(given.events, SurveyError("flow", what, todo=f"the whole story is in {log}"))
     return 0
 
 
@@ -56,7 +59,10 @@ def _run(given: argparse.Namespace) -> None:
 def _flow(given: argparse.Namespace) -> None:
     from flows.survey import survey
 
-    survey(str(given.survey), out=str(given.out), overrides=given.overrides, events=given.events)
+    try:
+        survey(str(given.survey), out=str(given.out), overrides=given.overrides, events=given.events)
+    finally:
+        logging.shutdown()  # sends what was logged while the server is there
 
 
 def _fail(events: int | None, error: MinelocError) -> int:
@@ -70,7 +76,7 @@ def _fail(events: int | None, error: MinelocError) -> int:
 
 def _end_with_parent() -> None:
     """The parent holds the other end of stdin; when it is gone, so is the reason for this process group to be."""
-    sys.stdin.buffer.read()
+    os.read(0, 1)
     os.killpg(0, signal.SIGKILL)
 
 

@@ -48,7 +48,7 @@ def own_server(home: Path) -> Generator[Starting]:
         free.close()
         address = f"http://127.0.0.1:{port}/api"
         process = subprocess.Popen(
-            [sys.executable, "-m", "prefect", "server", "start", "--host", "127.0.0.1", "--port", str(port)],
+            [sys.executable, "-P", "-m", "prefect", "server", "start", "--host", "127.0.0.1", "--port", str(port)],
             env=os.environ | {"PREFECT_API_URL": address, "PREFECT_UI_API_URL": address},
             stdin=subprocess.DEVNULL,
             stdout=log,

@@ -30,9 +30,10 @@ class Stage:
     Attributes:
         name: of the stage.
         schema: version of what it writes; raised when the meaning of its output changes outside the code's closure.
-        entry: `module:function`, called with the inputs and arguments by name and with `out=`, and with `config=` and
-            `progress=` if it takes them.
+        entry: `module:function`, called with the inputs and arguments by name, with `out=`, `config=`, and with
+            `progress=` if it takes that.
         sections: the configuration sections that it reads; it sees the defaults in place of all others.
+        inside: if it writes several files: the one that it is given as `out`; the folder around is the output.
         volatile: files of its output folder that differ from run to run (timings) and are no part of its identity.
     """
 
@@ -40,6 +41,7 @@ class Stage:
     schema: int
     entry: str
     sections: tuple[str, ...] = ()
+    inside: str = ""
     volatile: frozenset[str] = frozenset()
 
     @property
@@ -130,24 +132,25 @@ class Job:
             ]
             for name, given in self.inputs.items()
         }
-        out = workspace / "out" / self.out_name
-        out.parent.mkdir()
+        result = workspace / "out" / self.out_name
+        out = result / self.stage.inside if self.stage.inside else result
+        out.parent.mkdir(parents=True)
         function = self.stage.function()
-        seen = Config(**{name: getattr(self.config, name) for name in self.stage.sections})
-        context = {"config": seen, "progress": progress}
+        listening = {"progress": progress} if "progress" in inspect.signature(function).parameters else {}
         try:
             function(
                 **{name: many if isinstance(self.inputs[name], tuple) else many[0] for name, many in paths.items()},
                 **self.arguments,
                 out=out,
-                **{name: context[name] for name in context.keys() & inspect.signature(function).parameters.keys()},
+                config=Config(**{name: getattr(self.config, name) for name in self.stage.sections}),
+                **listening,
             )
         except MinelocError as error:
             raise _retold(error, shown) from error
         for one in (one for given in self.inputs.values() for one in _group(given)):
             if one.is_source and store.source(one.path).digest != one.ref.digest:
                 raise StoreError(one.path, "changed while it was read", todo="run again when it is complete")
-        return out
+        return result
 
 
 def _group(given: Input | tuple[Input, ...]) -> tuple[Input, ...]:

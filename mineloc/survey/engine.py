@@ -15,7 +15,7 @@ from mineloc.output import one_line_errors
 from mineloc.store.store import Outcome, Store
 from mineloc.survey.events import Event, Listener
 from mineloc.survey.plan import Plan, Step
-from mineloc.survey.pool import Pool
+from mineloc.survey.pool import Pool, StoppedError
 
 
 class Engine:
@@ -51,6 +51,8 @@ class Engine:
         try:
             outcome = self._outcome(step, made)
             self._store.place(outcome.output, self.plan.out / step.to, beside=step.beside)
+        except StoppedError:
+            raise
         except MinelocError as error:
             self._listener(Event(step.name, "failed", line=error.line()))
             raise

@@ -45,7 +45,7 @@ def run_flow(
     with one_line_errors(log):
         log.parent.mkdir(parents=True, exist_ok=True)
         listening, telling = os.pipe()
-        command = [sys.executable, "-m", "flows", str(survey.absolute()), "--out", str(plan.out.absolute())]
+        command = [sys.executable, "-P", "-m", "flows", str(survey.absolute()), "--out", str(plan.out.absolute())]
         command += [f"--set={text}" for text in overrides]
         command += [f"--events={telling}", *([f"--server={server}"] if server else [])]
         with log.open("wb") as sink:

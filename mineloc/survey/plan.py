@@ -129,7 +129,7 @@ class Plan:
     @property
     def report(self) -> Path:
         """The HTML report."""
-        return self.out / "report.html"
+        return self.out / "report" / REPORT.inside
 
 
 def plan_survey(survey: Survey) -> Plan:
@@ -144,7 +144,7 @@ def plan_survey(survey: Survey) -> Plan:
             runs.append(Run(flight.name, method, survey.out / to))
     localized = tuple(Made(step.name) for step in steps if step.stage is LOCALIZE)
     title: dict[str, Json] = {"title": survey.title} if survey.title else {}
-    steps.append(Step("report", "", REPORT, "report.html", {"runs": localized}, config=survey.config, arguments=title))
+    steps.append(Step("report", "", REPORT, "report", {"runs": localized}, config=survey.config, arguments=title))
     return Plan(survey.out, survey.workers, tuple(steps), tuple(runs))
 
 
@@ -153,17 +153,26 @@ def _flight_steps(flight: Flight) -> Iterator[Step]:
     if flight.recording is not None:
         source = flight.recording
     else:
-        name = f"{flight.name} simulate"
-        given = {"mine": flight.mine} if isinstance(flight.mine, Path) else {}
-        arguments: dict[str, Json] = {"mine": flight.mine} if isinstance(flight.mine, str) else {}
-        yield Step(
-            name, flight.name, SIMULATE, f"recordings/{flight.name}.mcap", given, flight.config, arguments=arguments
-        )
-        source = Made(name)
+        simulate = _simulate_step(flight)
+        yield simulate
+        source = Made(simulate.name)
     inputs: dict[str, Wanted] = {"recording": source}
     if flight.sequence is not None:
         inputs["sequence"] = flight.sequence
     yield Step(f"{flight.name} ingest", flight.name, INGEST, f"flights/{flight.name}.mcap", inputs, flight.config)
+
+
+def _simulate_step(flight: Flight) -> Step:
+    inputs: dict[str, Wanted] = {}
+    arguments: dict[str, Json] = {}
+    if isinstance(flight.mine, Path):
+        inputs["mine"] = flight.mine
+    else:
+        arguments["mine"] = flight.mine
+    if flight.graph is not None:
+        inputs["graph"] = flight.graph
+    to = f"recordings/{flight.name}.mcap"
+    return Step(f"{flight.name} simulate", flight.name, SIMULATE, to, inputs, flight.config, arguments)
 
 
 def _run_steps(flight: Flight, method: str, to: str) -> Iterator[Step]:

@@ -17,10 +17,17 @@ from mineloc.errors import MinelocError, SurveyError
 from mineloc.progress import Progress, quiet
 from mineloc.stages.stage import Job
 from mineloc.store.store import Outcome
-from mineloc.survey.worker import Crashed, Progressed, Reply, Request, Waiting
+from mineloc.survey.messages import Crashed, Progressed, Reply, Request, Waiting
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 STOP_S = 3.0
+
+
+class StoppedError(SurveyError):
+    """The pool was closed, on purpose; nobody needs to be told."""
+
+    def __init__(self) -> None:
+        super().__init__("survey", "stopped", todo="run again; what is done is kept")
 
 
 class Pool:
@@ -56,7 +63,8 @@ class Pool:
 
         Raises:
             MinelocError: what the stage says.
-            SurveyError: the process died, the program failed, or the pool was closed.
+            SurveyError: the process died, or the program failed.
+            StoppedError: the pool was closed.
         """
         worker = self._free.get()
         try:
@@ -86,9 +94,9 @@ class Pool:
     def _start(self) -> subprocess.Popen[bytes]:
         with self._guard, self._log.open("ab") as log:
             if self._closed:
-                raise _closed()
+                raise StoppedError
             worker = subprocess.Popen(
-                [sys.executable, "-m", "mineloc.survey.worker"],
+                [sys.executable, "-P", "-m", "mineloc.survey.worker"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
@@ -127,15 +135,11 @@ class Pool:
                         )
         except (EOFError, BrokenPipeError, pickle.UnpicklingError, ValueError):
             if self._closed:
-                raise _closed() from None
+                raise StoppedError from None
             code = worker.wait()
             raise SurveyError(
                 name, f"its process died ({_cause(code)})", todo=f"free memory or use fewer workers; see {self._log}"
             ) from None
-
-
-def _closed() -> SurveyError:
-    return SurveyError("survey", "stopped", todo="run again; what is done is kept")
 
 
 def _cause(code: int) -> str:

@@ -15,4 +15,4 @@ LOCALIZE = Stage(
 )
 EVALUATE = Stage("evaluate", 1, "mineloc.survey.score:score", ("evaluate",))
 RECORD = Stage("record", 1, "mineloc.view.run:record_run", ("evaluate", "view"))
-REPORT = Stage("report", 1, "mineloc.report.report:report", ("evaluate", "report"))
+REPORT = Stage("report", 1, "mineloc.report.page:write_report", ("evaluate", "report"), inside="report.html")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import TracebackType
 from typing import Any
 
+from rich.box import SIMPLE
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -12,8 +13,14 @@ from rich.text import Text
 
 from mineloc.survey.events import Event
 from mineloc.survey.plan import Plan
-from mineloc.survey.summary import COLUMNS
 
+FIGURES = {
+    "coverage_percent": "cover %",
+    "ape_rmse_m": "RMSE m",
+    "ape_max_m": "max m",
+    "ape_rmse_deg": "RMSE °",
+    "drift_percent": "drift %",
+}
 _MARKS = {"done": ("[green]✓[/]", ""), "known": ("[cyan]=[/]", " known"), "failed": ("[red]✗[/]", "")}
 
 
@@ -94,11 +101,19 @@ class _Rate(ProgressColumn):
 
 def summary_table(rows: list[dict[str, Any]]) -> Table:
     """The runs' figures; unknown ones are a dash."""
-    table = Table()
-    for key, title in COLUMNS.items():
-        table.add_column(title, justify="left" if key in ("flight", "method", "trajectory", "alignment") else "right")
+    alignments = sorted({row["alignment"] for row in rows if row["alignment"]})
+    table = Table(
+        box=SIMPLE,
+        caption=f"position errors after alignment: {', '.join(alignments)}" if alignments else None,
+        caption_justify="left",
+    )
+    for title in ("flight", "method", "poses"):
+        table.add_column(title, overflow="fold")
+    for title in FIGURES.values():
+        table.add_column(title, justify="right", no_wrap=True)
     for row in rows:
-        table.add_row(*("–" if row[key] is None else str(row[key]) for key in COLUMNS))
+        words = (row["flight"], row["method"], row["trajectory"], *(row[key] for key in FIGURES))
+        table.add_row(*("–" if word is None else str(word) for word in words))
     return table
 
 

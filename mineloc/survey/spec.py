@@ -42,6 +42,7 @@ class FlightSpec(Section):
     recording: str | None = None
     sequence: str | None = None
     mine: str | None = None
+    graph: str | None = None
     reference: str | None = None
     config: dict[str, Any] = Field(default_factory=dict)
 
@@ -63,12 +64,14 @@ class Flight:
 
     Attributes:
         mine: a file, or the name of a built-in mine.
+        graph: the roadway graph of a mesh, in place of the one found in it.
     """
 
     name: str
     recording: Path | None
     sequence: Path | None
     mine: Path | str | None
+    graph: Path | None
     reference: Path | None
     config: Config
 
@@ -132,6 +135,7 @@ def _flight(path: Path, spec: FlightSpec, config: Mapping[str, Any], overrides: 
         recording=_existing(path, where, "recording", spec.recording),
         sequence=_existing(path, where, "sequence", spec.sequence),
         mine=_mine(path, where, spec.mine),
+        graph=_existing(path, where, "graph", spec.graph),
         reference=_existing(path, where, "reference", spec.reference),
         config=layered_config([config, spec.config], overrides, where=where),
     )

@@ -8,21 +8,21 @@ from typing import Any
 
 from mineloc.survey.plan import Plan, Run
 
-COLUMNS = {
-    "flight": "flight",
-    "method": "method",
-    "trajectory": "trajectory",
-    "coverage_percent": "coverage %",
-    "ape_rmse_m": "APE RMSE m",
-    "ape_max_m": "APE max m",
-    "ape_rmse_deg": "APE RMSE °",
-    "drift_percent": "drift %",
-    "alignment": "aligned",
-}
+KEYS = (
+    "flight",
+    "method",
+    "trajectory",
+    "coverage_percent",
+    "ape_rmse_m",
+    "ape_max_m",
+    "ape_rmse_deg",
+    "drift_percent",
+    "alignment",
+)
 
 
 def summary(plan: Plan, *, flight: str | None = None) -> list[dict[str, Any]]:
-    """One row a run and trajectory, keys as in `COLUMNS`; None is unknown (no reference, too short for drift).
+    """One row a run and trajectory, keys as in `KEYS`; None is unknown (no reference, too short for drift).
 
     Drift is KITTI's: translation error over sub-trajectories of 100 m and more, percent of their length.
     """
@@ -33,7 +33,7 @@ def _rows(run: Run) -> list[dict[str, Any]]:
     found = _read(run.metrics)
     who: dict[str, Any] = {"flight": run.flight, "method": run.method}
     if not found["trajectories"]:
-        return [dict.fromkeys(COLUMNS) | who]
+        return [dict.fromkeys(KEYS) | who]
     return [who | _figures(one) for one in found["trajectories"]]
 
 
