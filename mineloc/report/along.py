@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mineloc.data import F64, Trajectory
+from mineloc.data import F64, I64
 from mineloc.report.svg import BLACK, DASHES, ORANGE, SERIES, WIDTH_IN, draw, keep_peaks
 
 _MAX_BANDS = 400
@@ -23,6 +23,24 @@ class Band:
     from_m: float
     to_m: float
     kind: Literal["degenerate", "untrusted"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Way:
+    """What metres flown are counted along.
+
+    Attributes:
+        stamps_ns: (n,) rising.
+        path_m: (n,) metres flown.
+    """
+
+    stamps_ns: I64
+    path_m: F64
+
+    def metres(self, at_ns: I64 | int) -> F64:
+        """Metres flown at a time or times, held at the ends."""
+        start = self.stamps_ns[0]
+        return np.interp(at_ns - start, self.stamps_ns - start, self.path_m)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,9 +89,3 @@ def shade(axes: Axes, bands: Sequence[Band]) -> None:
             axes.axvspan(band.from_m, band.to_m, color=ORANGE, alpha=0.3, linewidth=0, label=label)
         else:
             axes.axvspan(band.from_m, band.to_m, color=BLACK, alpha=0.45, linewidth=0.8, label=label)
-
-
-def metres_at(trajectory: Trajectory, stamp_ns: int) -> float:
-    """Metres flown at a time, held at the ends."""
-    start = trajectory.stamps_ns[0]
-    return float(np.interp(stamp_ns - start, trajectory.stamps_ns - start, trajectory.path_m))

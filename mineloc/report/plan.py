@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from mineloc.data import F64
+from mineloc.data import F64, I64
 from mineloc.report.along import Band, shade
 from mineloc.report.svg import BLACK, BLUE, WIDTH_IN, draw, error_colors, keep_peaks
 from mineloc.stages.run_folder import RunFolder
@@ -35,12 +35,13 @@ class Density:
     extent_m: tuple[float, float, float, float]
 
 
-def density(run: RunFolder, T_frame_map: F64) -> Density | None:
+def density(run: RunFolder, T_frame_map: F64, *, detail: float = 1.0) -> Density | None:
     """The keyframe points, placed by the smoothed poses and seen from above; None without points.
 
     Args:
-        run: its points are walked in chunks: memory does not grow with them.
+        run: its points are placed in portions: a big map needs little memory.
         T_frame_map: (4, 4) from the run's map to the frame of the figure.
+        detail: 1 for a page with one run, less for many.
     """
     table = run.points()
     if table.is_empty():
@@ -53,7 +54,7 @@ def density(run: RunFolder, T_frame_map: F64) -> Density | None:
     for part in chunks:
         xy = _plan_xy(poses, rows_of[part], points[part])
         low, high = np.minimum(low, xy.min(axis=0)), np.maximum(high, xy.max(axis=0))
-    pixel_m = max(float((high - low).max()) / _PIXELS, _MIN_PIXEL_M)
+    pixel_m = max(float((high - low).max()) / (_PIXELS * detail), _MIN_PIXEL_M)
     columns, rows = (np.ceil((high - low) / pixel_m).astype(int) + 1).tolist()
     counts = np.zeros(rows * columns)
     for part in chunks:
@@ -68,14 +69,29 @@ def _plan_xy(poses: F64, rows_of: Any, points: Any) -> F64:
     return np.einsum("nij,nj->ni", pose[:, :, :3], points.astype(np.float64)) + pose[:, :, 3]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Colored:
+    """The part of the estimate for which a number is known.
+
+    Attributes:
+        where: (n,) indices into the estimate, rising; a line is not drawn across what is left out.
+        value: (n,) what colours it.
+        label: what it is, with its unit.
+    """
+
+    where: I64
+    value: F64
+    label: str
+
+
 def plan_view(
     key: str,
     *,
     background: Density | None,
     reference: F64 | None,
     estimate: F64,
-    value: F64 | None,
-    label: str,
+    colored: Colored | None,
+    detail: float = 1.0,
 ) -> str:
     """SVG of the flight over the mine, equal aspect.
 
@@ -84,13 +100,14 @@ def plan_view(
         background: the points of the mine.
         reference: (n, 3) positions, drawn thin and black.
         estimate: (m, 3) positions.
-        value: (m,) what colours the estimate, metres; None for one colour.
-        label: what `value` is, with its unit.
+        colored: what colours the estimate; None for one colour.
+        detail: as of `density`.
     """
     x0, x1, y0, y1 = _bounds(background, reference, estimate)
-    height = float(np.clip(6.0 * (y1 - y0) / (x1 - x0) + 0.9, 2.6, 8.6))
+    height = float(np.clip(5.6 * (y1 - y0) / (x1 - x0) + 0.75, 2.0, 6.7))
 
     def paint(figure: Figure) -> None:
+        figure.set_dpi(_COLORED_DPI * detail)
         axes = figure.add_subplot()
         axes.set_aspect("equal")
         axes.set_xlim(x0, x1)
@@ -100,13 +117,14 @@ def plan_view(
         if reference is not None:
             thin = reference[_spread(len(reference))]
             axes.plot(thin[:, 0], thin[:, 1], color=BLACK, linewidth=0.5, label="reference")
-        if value is None:
+        if colored is None or len(colored.where) < len(estimate):
             thin = estimate[_spread(len(estimate))]
-            axes.plot(thin[:, 0], thin[:, 1], color=BLUE, linewidth=1.2, label="estimate")
-        else:
-            _paint_colored(figure, axes, estimate, value, label)
-        axes.plot(*estimate[0, :2], "o", color=BLACK, markersize=4, markerfacecolor="white", label="start")
-        axes.plot(*estimate[-1, :2], "s", color=BLACK, markersize=3.5, label="end")
+            label = "estimate, smoothed" if colored is None else "estimate, not compared"
+            axes.plot(thin[:, 0], thin[:, 1], color=BLUE, linewidth=1.2, label=label)
+        if colored is not None:
+            _paint_colored(figure, axes, estimate, colored)
+        axes.plot(*estimate[0, :2], "o", color=BLACK, markersize=4.5, markerfacecolor="white", label="start", zorder=4)
+        axes.plot(*estimate[-1, :2], "s", color=BLACK, markersize=4, label="end", zorder=4)
         axes.set_xlabel("x (m)")
         axes.set_ylabel("y (m)")
         _paint_scale(axes, x1 - x0)
@@ -116,7 +134,7 @@ def plan_view(
 
 
 def long_section(
-    key: str, *, along_m: F64, smoothed_z: F64, reference_z: F64 | None, bands: list[Band], unit: str
+    key: str, *, along_m: F64, smoothed_z: F64, reference_z: F64 | None, bands: list[Band], x_label: str
 ) -> str:
     """SVG of the height along the way.
 
@@ -126,7 +144,7 @@ def long_section(
         smoothed_z: (n,) estimated height.
         reference_z: (n,) reference height.
         bands: stretches to shade.
-        unit: label of the horizontal axis.
+        x_label: of the horizontal axis.
     """
 
     def paint(figure: Figure) -> None:
@@ -137,7 +155,7 @@ def long_section(
             chosen = keep_peaks(along_m, reference_z)
             axes.plot(along_m[chosen], reference_z[chosen], color=BLACK, linewidth=2.2, alpha=0.35, label="reference")
         axes.plot(along_m[pick], smoothed_z[pick], color=BLUE, linewidth=1.0, label="estimate, smoothed")
-        axes.set_xlabel(unit)
+        axes.set_xlabel(x_label)
         axes.set_ylabel("height z (m)")
         axes.margins(x=0.01, y=0.12)
         axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, borderaxespad=0.2)
@@ -170,26 +188,32 @@ def _paint_density(axes: Axes, density: Density) -> None:
     full = max(float(np.percentile(occupied, 95)), 1.0)
     # few levels of grey: the picture says where the walls are, and the file stays small
     shade = np.ceil(np.clip(np.sqrt(density.counts / full), 0.0, 1.0) * 6.0) / 6.0
-    rgba = np.full((*density.counts.shape, 4), 120, dtype=np.uint8)
-    rgba[..., 3] = np.round(150.0 * shade).astype(np.uint8)
+    rgba = np.full((*density.counts.shape, 4), 90, dtype=np.uint8)
+    rgba[..., 3] = np.round(190.0 * shade).astype(np.uint8)
     axes.imshow(rgba, extent=density.extent_m, origin="lower", interpolation="none", aspect="equal", zorder=0.5)
 
 
-def _paint_colored(figure: Figure, axes: Axes, estimate: F64, value: F64, label: str) -> None:
-    step = np.linalg.norm(np.diff(estimate[:, :2], axis=0, prepend=estimate[:1, :2]), axis=1)
-    pick = keep_peaks(np.cumsum(step), value, columns=_MAX_VERTICES)
-    xy, colored = estimate[pick, :2], value[pick]
+def _paint_colored(figure: Figure, axes: Axes, estimate: F64, colored: Colored) -> None:
+    along = estimate[colored.where, :2]
+    step = np.linalg.norm(np.diff(along, axis=0, prepend=along[:1]), axis=1)
+    pick = keep_peaks(np.cumsum(step), colored.value, columns=_MAX_VERTICES)
+    xy, value = along[pick], colored.value[pick]
+    skipped = (colored.where - np.arange(len(colored.where)))[pick]
+    joined = np.diff(skipped) == 0
     lines = LineCollection(
-        list(np.stack([xy[:-1], xy[1:]], axis=1)), cmap=error_colors(), linewidth=2.0, capstyle="round", zorder=2.5
+        list(np.stack([xy[:-1], xy[1:]], axis=1)[joined]),
+        cmap=error_colors(),
+        linewidth=2.2,
+        capstyle="round",
+        zorder=2.5,
     )
-    lines.set_array(np.maximum(colored[:-1], colored[1:]))
-    lines.set_clim(0.0, max(float(value.max()), 1e-3))
+    lines.set_array(np.maximum(value[:-1], value[1:])[joined])
+    lines.set_clim(0.0, max(float(colored.value.max()), 1e-3))
     # thousands of short coloured pieces are smaller, and drawn faster, as a picture
     lines.set_rasterized(True)
-    figure.set_dpi(_COLORED_DPI)
     axes.add_collection(lines)
     bar = figure.colorbar(lines, cax=axes.inset_axes((1.02, 0.0, 0.025, 1.0)))
-    bar.set_label(label)
+    bar.set_label(colored.label)
     bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
 
 
@@ -199,12 +223,12 @@ def _paint_scale(axes: Axes, width_m: float) -> None:
     right = axes.get_xlim()[1]
     across = axes.get_xaxis_transform()
     axes.plot(
-        [right - length, right], [1.02, 1.02], color=BLACK, linewidth=2.5, transform=across, clip_on=False,
+        [right - length, right], [1.03, 1.03], color=BLACK, linewidth=2.5, transform=across, clip_on=False,
         solid_capstyle="butt",
     )  # fmt: skip
     axes.annotate(
         f"{length:g} m",
-        (right - length, 1.02),
+        (right - length, 1.03),
         xycoords=across,
         xytext=(-5, 0),
         textcoords="offset points",

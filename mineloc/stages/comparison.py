@@ -46,14 +46,14 @@ class Comparison:
 
 
 def compare(run: RunFolder, config: EvaluateConfig) -> dict[str, Comparison]:
-    """`online` and `smoothed` beside the run's reference; empty without one, or when no times are in common."""
+    """Both `online` and `smoothed` beside the run's reference; empty without one, or without times in common."""
+    if run.reference is None:
+        return {}
     out: dict[str, Comparison] = {}
     for name, estimate in (("online", run.online), ("smoothed", run.smoothed)):
-        if run.reference is None:
-            continue
         pairs = pair(run.reference, estimate, config)
         if not len(pairs):
-            continue
+            return {}
         scores = score(name, run.reference, estimate, pairs, ALIGNMENTS, config)
         by_kind = {one.absolute.alignment: one.absolute for one in scores.aligned}
         shown = by_kind.get(_shown_alignment(run, config), by_kind["origin"])

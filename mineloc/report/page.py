@@ -1,0 +1,146 @@
+"""The accuracy report: one HTML file that opens anywhere, and beside it the same numbers as JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from mineloc import __version__
+from mineloc.config import Config
+from mineloc.errors import OutputError
+from mineloc.output import new_file
+from mineloc.progress import Progress, quiet
+from mineloc.report.facts import RunFacts, run_facts
+from mineloc.report.figures import RunFigures, methods_figure, run_figures
+from mineloc.report.numbers import Numbers
+from mineloc.stages.run_folder import RunFolder
+
+SCHEMA = "mineloc.report/1"
+MAX_BYTES = 1_000_000
+_DETAILS = (1.0, 0.7, 0.5, 0.35, 0.2)
+_ROWS = 20
+_ALIGNED = {"none": "nothing aligned", "origin": "first pose laid on first pose", "se3": "fitted as a whole"}
+
+
+def write_report(
+    runs: Sequence[Path],
+    out: Path,
+    *,
+    config: Config,
+    title: str | None = None,
+    overwrite: bool = False,
+    progress: Progress = quiet,
+) -> Path:
+    """Write `out` (HTML, below 1 MB, nothing outside of it is needed) and its JSON sidecar. Equal inputs, equal bytes.
+
+    Args:
+        runs: run folders, one or several; several are compared side by side.
+        out: `.html` to write; the sidecar has its name and `.json`.
+        config: sections `evaluate` and `report`.
+        title: heading; the configuration's when None.
+        overwrite: replace both files.
+        progress: told the runs that are done.
+
+    Returns:
+        `out`.
+
+    Raises:
+        FormatError: not a run folder.
+        OutputError: a file exists or cannot be written; so many runs that the page would be too large.
+        ValueError: no runs.
+    """
+    if not runs:
+        raise ValueError("a report needs a run")
+    sidecar = out.with_suffix(".json")
+    if sidecar == out:
+        raise OutputError(out, "is the name of the sidecar", expected="a name ending with .html", todo="rename --out")
+    facts: list[RunFacts] = []
+    for number, path in enumerate(runs):
+        progress(number, len(runs), "runs")
+        facts.append(run_facts(RunFolder.open(path), letter_of(number), config.evaluate))
+    document = report_document(facts, title if title is not None else config.report.title, config)
+    page = _page(facts, document, sidecar.name, where=out)
+    text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    # both or neither: the page is renamed into place only after the sidecar could be written
+    with new_file(out, overwrite=overwrite) as html, new_file(sidecar, overwrite=overwrite) as numbers:
+        html.write_bytes(page)
+        numbers.write_text(text, encoding="utf-8")
+    progress(len(runs), len(runs), "runs")
+    return out
+
+
+def report_document(facts: Sequence[RunFacts], title: str, config: Config) -> dict[str, Any]:
+    """Everything that the page prints, as JSON values."""
+    return {
+        "schema": SCHEMA,
+        "title": title,
+        "mineloc_version": __version__,
+        "configuration": {name: getattr(config, name).model_dump(mode="json") for name in ("evaluate", "report")},
+        "runs": [one.values for one in facts],
+    }
+
+
+def letter_of(number: int) -> str:
+    """A, B … Z, AA, AB …: names that fit into a figure."""
+    letters = ""
+    number += 1
+    while number:
+        number, rest = divmod(number - 1, 26)
+        letters = chr(ord("A") + rest) + letters
+    return letters
+
+
+def _page(facts: Sequence[RunFacts], document: Mapping[str, Any], sidecar: str, *, where: Path) -> bytes:
+    """The page with as much detail in its figures as fits."""
+    size = 0
+    for detail in _DETAILS:
+        figures = [run_figures(one, f"run{number}", detail=detail) for number, one in enumerate(facts)]
+        page = _rendered(document, figures, methods_figure(facts), sidecar).encode()
+        size = len(page)
+        if size <= MAX_BYTES:
+            return page
+    raise OutputError(
+        where,
+        f"{len(facts)} runs make a page of {size / 1e6:.1f} MB",
+        expected=f"at most {MAX_BYTES / 1e6:g} MB",
+        todo="report fewer runs at once",
+    )
+
+
+def _rendered(document: Mapping[str, Any], figures: Sequence[RunFigures], methods: str | None, sidecar: str) -> str:
+    environment = Environment(
+        loader=PackageLoader("mineloc.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    style = files("mineloc.report").joinpath("templates", "report.css").read_text(encoding="utf-8")
+    return environment.get_template("report.html.j2").render(
+        document=document,
+        number=Numbers(document),
+        longest=_longest,
+        rep_count=max(len(run["accuracy"]["smoothed"]["rep"]) if run["accuracy"] else 0 for run in document["runs"]),
+        aligned=_ALIGNED,
+        sidecar=sidecar,
+        style=Markup(style),
+        # drawn by us; names from outside never get into a figure
+        figures=[{name: svg and Markup(svg) for name, svg in _named(one)} for one in figures],
+        methods_figure=methods and Markup(methods),
+    )
+
+
+def _named(figures: RunFigures) -> list[tuple[str, str | None]]:
+    return [("plan", figures.plan), ("section", figures.section), ("along", figures.along)]
+
+
+def _longest(stretches: Sequence[Mapping[str, Any]]) -> list[int]:
+    """Indices of the longest in time, in the order of flight."""
+    by_length = sorted(range(len(stretches)), key=lambda k: (-stretches[k]["duration_s"], k))
+    return sorted(by_length[:_ROWS])
