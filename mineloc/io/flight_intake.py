@@ -165,7 +165,7 @@ class FlightIntake:
         if roles.lidar is not None:
             sweeps = SweepDecoder(told.lidar, where=self._where(roles.lidar))
             monitor = TopicMonitor("lidar", roles.lidar)
-            self.lidar = LidarIntake(monitor, sweeps, self._motion, writer, self._before_sweep)
+            self.lidar = LidarIntake(monitor, sweeps, told.lidar, self._motion, writer)
             self._takers[roles.lidar.name] = self.lidar
         if roles.reference is not None:
             monitor = TopicMonitor("reference", roles.reference)
@@ -181,10 +181,6 @@ class FlightIntake:
 
     def _pose_decoder(self, topic: Topic, rules: ReferenceRules, T_places_body: Any, parent: str) -> PoseDecoder:
         return PoseDecoder(topic.msgtype, rules, T_places_body, parent=parent, where=self._where(topic))
-
-    def _before_sweep(self) -> None:
-        if self._imu is not None:
-            self._imu.flush()
 
     def run(self, step: Callable[[RawMessage], None]) -> None:
         """Take all messages; `step` is called after each.

@@ -7,9 +7,9 @@ from typing import Protocol
 
 import numpy as np
 
-from mineloc.data import Sweep, Trajectory
+from mineloc.data import F32, Sweep, Trajectory
 from mineloc.errors import IngestError
-from mineloc.io import canonical
+from mineloc.io.cloud_transcoder import CanonicalCloud, CloudTranscoder, learn, view_canonical
 from mineloc.io.findings import Finding
 from mineloc.io.flight_layout import PERIOD_KEY
 from mineloc.io.flight_writer import FlightWriter
@@ -19,8 +19,9 @@ from mineloc.io.imu_monitor import ImuMonitor
 from mineloc.io.messages import ImuDecoder, PoseDecoder
 from mineloc.io.motion_watch import MotionWatch
 from mineloc.io.recording import RawMessage
+from mineloc.io.sequence import LidarRules
 from mineloc.io.stream_statistics import Sampler
-from mineloc.io.sweep_decoder import SweepDecoder
+from mineloc.io.sweep_decoder import DecodedSweep, SweepDecoder
 from mineloc.io.topic_monitor import TopicMonitor
 
 # Small messages are decoded so many at once.
@@ -73,29 +74,31 @@ class LidarIntake:
     Args:
         monitor: of the topic.
         decoder: for clouds of any driver; those of a canonical flight are passed on as they are.
+        told: the sequence file's `[lidar]` section.
         motion: told of the sweeps.
         writer: where they go.
-        before_sweep: called before each sweep is written, so that inertial samples of its time go first.
     """
 
     def __init__(
         self,
         monitor: TopicMonitor,
         decoder: SweepDecoder,
+        told: LidarRules,
         motion: MotionWatch,
         writer: FlightWriter,
-        before_sweep: Callable[[], None],
     ) -> None:
         self.monitor = monitor
         self.unreadable = Unreadable()
         self._decoder = decoder
+        self._told = told
+        self._transcoder: CloudTranscoder | None = None
+        self._may_learn = True
         self._motion = motion
         self._writer = writer
-        self._before_sweep = before_sweep
         self._points = Sampler()
         self._message_points = 0
         self._kept_points = 0
-        self._last: Sweep | None = None
+        self._fields: frozenset[str] = frozenset()
         self.clouds = 0
 
     @property
@@ -110,58 +113,75 @@ class LidarIntake:
             IngestError: clouds without x y z, or whose point times fit no rule.
         """
         self.clouds += 1
-        if PERIOD_KEY in raw.notes and self._pass_on(raw):
-            return
         try:
             message = raw.message
         except IngestError as error:
             self.unreadable.add(error)
             return
+        if self._pass_on(raw, message) or self._rewrite(raw, message):
+            return
         for decoded in self._decoder.decode(message, log_ns=raw.log_ns):
-            self._write(decoded.sweep, decoded.log_ns, decoded.header_ns, decoded.message_points)
+            self._write(decoded)
+        if self._may_learn and self._decoder.time_rule is not None:
+            self._may_learn = False
+            self._transcoder = learn(self._decoder, self._told, message)
 
     def flush(self) -> None:
         """See `Intake`."""
         for decoded in self._decoder.finish():
-            self._write(decoded.sweep, decoded.log_ns, decoded.header_ns, decoded.message_points)
+            self._write(decoded)
+        self.monitor.catch_up()
 
-    def _pass_on(self, raw: RawMessage) -> bool:
-        """Write a canonical sweep as it stands; False if it is none, or holds what a canonical sweep must not."""
-        try:
-            sweep = canonical.decode_sweep(raw.data, period_ns=int(raw.notes[PERIOD_KEY]))
-        except Exception:  # noqa: BLE001  # whatever it is, it is not ours: the decoder will look at it
+    def _pass_on(self, raw: RawMessage, message: object) -> bool:
+        """Write a sweep of a canonical flight as it stands; False if it is none."""
+        period = raw.notes.get(PERIOD_KEY, "")
+        cloud = view_canonical(raw.data, message) if period.isdigit() and self._told == LidarRules() else None
+        if cloud is None:
             return False
-        if not len(sweep) or not bool(np.isfinite(sweep.points_lidar).all()):
-            return False
-        if self._accept(sweep, raw.log_ns, sweep.stamp_ns, len(sweep)):
-            self._writer.add_raw_sweep(
-                raw.data,
-                stamp_ns=sweep.stamp_ns,
-                end_ns=sweep.end_ns,
-                period_ns=sweep.period_ns,
-                publish_ns=raw.publish_ns,
-            )
+        self._write_raw(cloud, int(period), raw.log_ns, raw.publish_ns)
         return True
 
-    def _write(self, sweep: Sweep, log_ns: int, header_ns: int, message_points: int) -> None:
-        if self._accept(sweep, log_ns, header_ns, message_points):
-            self._writer.add_sweep(sweep, publish_ns=max(log_ns, 0))
-
-    def _accept(self, sweep: Sweep, log_ns: int, header_ns: int, message_points: int) -> bool:
-        stamp, log, header = (np.array([t], dtype=np.int64) for t in (sweep.stamp_ns, log_ns, header_ns))
-        if not self.monitor.take(stamp, log, headers_ns=header)[0]:
+    def _rewrite(self, raw: RawMessage, message: object) -> bool:
+        """Write a cloud that is like those before without decoding it; False if it is not."""
+        if self._transcoder is None:
             return False
-        self._points.add(np.array([float(len(sweep))]))
+        cloud = self._transcoder.transcode(message)
+        if cloud is None:
+            return False
+        self._write_raw(cloud, self._transcoder.period_ns, raw.log_ns, max(raw.log_ns, 0))
+        return True
+
+    def _write_raw(self, cloud: CanonicalCloud, period_ns: int, log_ns: int, publish_ns: int) -> None:
+        n = len(cloud.points)
+        if self._accept(cloud.stamp_ns, log_ns, cloud.header_ns, cloud.points, n):
+            self._fields = self._fields or cloud.fields
+            self._writer.add_raw_sweep(
+                cloud.data,
+                stamp_ns=cloud.stamp_ns,
+                end_ns=cloud.end_ns,
+                period_ns=period_ns,
+                publish_ns=publish_ns,
+            )
+
+    def _write(self, decoded: DecodedSweep) -> None:
+        sweep = decoded.sweep
+        if self._accept(sweep.stamp_ns, decoded.log_ns, decoded.header_ns, sweep.points_lidar, decoded.message_points):
+            self._fields = self._fields or _fields_of(sweep)
+            self._writer.add_sweep(sweep, publish_ns=max(decoded.log_ns, 0))
+
+    def _accept(self, stamp_ns: int, log_ns: int, header_ns: int, points: F32, message_points: int) -> bool:
+        """Watch a sweep; False if its time has been before."""
+        if not self.monitor.take_one(stamp_ns, log_ns, header_ns):
+            return False
+        self._points.add_one(float(len(points)))
         self._message_points += message_points
-        self._kept_points += len(sweep)
-        self._last = sweep
-        self._motion.take_sweep(sweep)
-        self._before_sweep()
+        self._kept_points += len(points)
+        self._motion.take_sweep(stamp_ns, points)
         return True
 
     def points_health(self) -> PointsHealth | None:
         """What was seen of the points; None without a sweep."""
-        if self._last is None:
+        if not self.monitor.used:
             return None
         empty = sum(finding.count for finding in self.findings if finding.name == "empty_sweeps")
         return PointsHealth(
@@ -170,10 +190,15 @@ class LidarIntake:
             most=round(self._points.largest),
             dropped=self._message_points - self._kept_points,
             empty_sweeps=empty,
-            point_times=self._last.has_point_times,
-            rings=self._last.ring is not None,
-            intensity=self._last.intensity is not None,
+            point_times="t" in self._fields,
+            rings="ring" in self._fields,
+            intensity="intensity" in self._fields,
         )
+
+
+def _fields_of(sweep: Sweep) -> frozenset[str]:
+    there = {"t": sweep.has_point_times, "ring": sweep.ring is not None, "intensity": sweep.intensity is not None}
+    return frozenset(["x", *(name for name, is_there in there.items() if is_there)])
 
 
 class _Portions:

@@ -84,6 +84,21 @@ def read_exactly(file: BinaryIO, offset: int, length: int) -> bytes:
     return data
 
 
+def read_into(file: BinaryIO, offset: int, length: int, buffer: bytearray) -> memoryview:
+    """As `read_exactly`, into the beginning of `buffer`; the view is valid until the buffer is used again."""
+    if length > len(buffer):
+        raise RecordError(f"a record of {length} bytes (the limit is {MAX_RECORD_BYTES})")
+    view = memoryview(buffer)[:length]
+    try:
+        file.seek(offset)
+        got = file.readinto(view)  # type: ignore[attr-defined]  # BinaryIO does not declare it, every file has it
+    except OSError as error:
+        raise RecordError(f"the disk fails ({error.strerror})") from error
+    if got != length:
+        raise RecordError("the file ends within a record")
+    return view
+
+
 def parse_record(kind: type[R], content: bytes | memoryview) -> R:
     """The content of a record (without opcode and length) by the mcap library's own parser.
 

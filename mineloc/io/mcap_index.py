@@ -44,6 +44,7 @@ class Segment:
         plain_bytes: bytes after decompression, as announced.
         start_ns, end_ns: log times of its first and last message.
         is_chunk: False for a run of bare records.
+        is_compressed: whether the chunk's data are.
         channels: which channels have messages in it; None if nobody said.
         index_offsets: where each channel's message index lies, empty if there is none.
     """
@@ -54,6 +55,7 @@ class Segment:
     start_ns: int
     end_ns: int
     is_chunk: bool = True
+    is_compressed: bool = False
     channels: frozenset[int] | None = None
     index_offsets: tuple[int, ...] = ()
 
@@ -248,6 +250,7 @@ def _segment(chunk: ChunkIndex, size: int) -> Segment:
         plain_bytes=chunk.uncompressed_size,
         start_ns=chunk.message_start_time,
         end_ns=chunk.message_end_time,
+        is_compressed=bool(chunk.compression),
         channels=channels,
         index_offsets=tuple(chunk.message_index_offsets.values()),
     )

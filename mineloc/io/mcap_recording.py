@@ -17,11 +17,13 @@ from mineloc.errors import IngestError
 from mineloc.io.background import prefetched
 from mineloc.io.mcap_framing import (
     MAGIC,
+    MAX_RECORD_BYTES,
     RECORD_HEADER,
     RecordError,
     messages_in,
     parse_chunk_header,
     read_exactly,
+    read_into,
     unpack_chunk,
 )
 from mineloc.io.mcap_index import McapIndex, Segment, count_indexed, read_attachment, read_index
@@ -184,22 +186,30 @@ def _load_index(path: Path, file: BinaryIO, size: int) -> McapIndex:
 
 
 def _load(file: BinaryIO, segments: Iterable[Segment]) -> Generator[_Loaded]:
+    # compressed data are read into the same memory each time: fresh memory costs more than the reading
+    buffer = bytearray()
     for segment in segments:
         try:
-            yield segment, _plain(file, segment)
+            if segment.is_compressed:
+                if segment.length > len(buffer):
+                    buffer = bytearray(min(2 * segment.length, MAX_RECORD_BYTES))
+                yield segment, _plain(segment, read_into(file, segment.offset, segment.length, buffer))
+            else:
+                yield segment, _plain(segment, memoryview(read_exactly(file, segment.offset, segment.length)))
         except RecordError as error:
             yield segment, error
 
 
-def _plain(file: BinaryIO, segment: Segment) -> bytes | memoryview:
-    record = read_exactly(file, segment.offset, segment.length)
+def _plain(segment: Segment, record: memoryview) -> bytes | memoryview:
     if not segment.is_chunk:
         return record
     length = segment.length - RECORD_HEADER.size
     if length < 0 or RECORD_HEADER.unpack_from(record) != (Opcode.CHUNK, length):
         raise RecordError("nothing there but the index says so")
-    content = memoryview(record)[RECORD_HEADER.size :]
+    content = record[RECORD_HEADER.size :]
     header = parse_chunk_header(content, length)
+    if bool(header.compression) != segment.is_compressed:
+        raise RecordError("a damaged header")
     return unpack_chunk(header, content[header.data_start :])
 
 

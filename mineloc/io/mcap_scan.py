@@ -135,12 +135,12 @@ class _Scan:
             content = read_exactly(self.file, position + RECORD_HEADER.size, length)
             header = head = parse_chunk_header(content, length)
             plain = unpack_chunk(header, memoryview(content)[header.data_start :])
-            self._count(position, length + RECORD_HEADER.size, plain, is_chunk=True)
+            self._count(position, length + RECORD_HEADER.size, plain, header)
         except RecordError as error:
             self.orphan_counts = {}
             self._note(position, f"unreadable chunk ({error})", head=head)
 
-    def _count(self, offset: int, length: int, plain: bytes | memoryview, *, is_chunk: bool) -> None:
+    def _count(self, offset: int, length: int, plain: bytes | memoryview, header: ChunkHeader | None) -> None:
         counts: dict[int, int] = {}
         stamps: list[int] = []
         for channel_id, log_ns, _, _ in messages_in(plain, schemas=self.index.schemas, channels=self.index.channels):
@@ -149,7 +149,16 @@ class _Scan:
         if not stamps:
             return
         self.index.segments.append(
-            Segment(offset, length, len(plain), min(stamps), max(stamps), is_chunk, frozenset(counts))
+            Segment(
+                offset,
+                length,
+                len(plain),
+                min(stamps),
+                max(stamps),
+                is_chunk=header is not None,
+                is_compressed=header is not None and bool(header.compression),
+                channels=frozenset(counts),
+            )
         )
         for channel_id, count in counts.items():
             self.found[channel_id] = self.found.get(channel_id, 0) + count
@@ -167,7 +176,7 @@ class _Scan:
         start, self.run_start = self.run_start, None
         if end > start:
             try:
-                self._count(start, end - start, read_exactly(self.file, start, end - start), is_chunk=False)
+                self._count(start, end - start, read_exactly(self.file, start, end - start), None)
             except RecordError as error:
                 self._note(start, str(error))
 

@@ -48,7 +48,7 @@ _LZ4_LEVEL = -2
 # Measured ranges are noise to lz4: where a part of a chunk does not shrink below this share, the chunk is stored as it
 # is, which saves a third of the time of writing and of every later reading.
 _WORTH_IT = 0.9
-_TRIED_BYTES = 32 << 10
+_TRIED_BYTES = 8 << 10
 # More pieces than this (a sweep has two) are joined before they are written.
 _FEW_PIECES = 8
 _WORKERS = 2

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mineloc.data import F32, F64, Sweep
+from mineloc.data import F32, F64
 
 _LOOK_EVERY_NS = 1_000_000_000
 _AZIMUTHS = 72
@@ -25,12 +25,12 @@ class MotionWatch:
         self._low = np.full(3, np.inf)
         self._high = np.full(3, -np.inf)
 
-    def take_sweep(self, sweep: Sweep) -> None:
-        """Look at a sweep, once a second until something changed."""
-        if self._shape_changed or sweep.stamp_ns < self._next_look_ns:
+    def take_sweep(self, stamp_ns: int, points_lidar: F32) -> None:
+        """Look at (n, 3) points of a sweep, once a second until something changed."""
+        if self._shape_changed or stamp_ns < self._next_look_ns:
             return
-        self._next_look_ns = sweep.stamp_ns + _LOOK_EVERY_NS
-        shape = _shape(sweep.points_lidar)
+        self._next_look_ns = stamp_ns + _LOOK_EVERY_NS
+        shape = _shape(points_lidar)
         self._looks += 1
         if self._first is None:
             self._first = shape

@@ -74,10 +74,27 @@ class Sampler:
             self._filled += len(picked[:room])
             picked = picked[room:]
             if self._filled == len(self._kept):
-                self._kept[: self._filled // 2] = self._kept[::2].copy()
-                self._filled //= 2
-                self._stride *= 2
+                self._halve()
                 picked = picked[::2]
+
+    def add_one(self, value: float) -> None:
+        """Take one value, finite."""
+        self.smallest = min(self.smallest, value)
+        self.largest = max(self.largest, value)
+        if self._seen % self._stride == 0:
+            self._keep(value)
+        self._seen += 1
+
+    def _keep(self, value: float) -> None:
+        self._kept[self._filled] = value
+        self._filled += 1
+        if self._filled == len(self._kept):
+            self._halve()
+
+    def _halve(self) -> None:
+        self._kept[: self._filled // 2] = self._kept[::2].copy()
+        self._filled //= 2
+        self._stride *= 2
 
     def quantile(self, share: float) -> float:
         """NaN without values."""

@@ -87,6 +87,16 @@ class SweepDecoder:
         """What the point times mean; None before it is decided."""
         return None if self._rules is None else self._rules.times
 
+    @property
+    def ring_rule(self) -> RingRule | None:
+        """How the points get their ring; None before it is decided."""
+        return None if self._rules is None else self._rules.rings
+
+    @property
+    def period_ns(self) -> int | None:
+        """Nominal duration of a revolution; None before it is decided."""
+        return None if self._rules is None else self._rules.period_ns
+
     def decode(self, message: object, *, log_ns: int) -> list[DecodedSweep]:
         """Take one decoded rosbags PointCloud2.
 

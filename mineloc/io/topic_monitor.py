@@ -15,6 +15,7 @@ _NS = 1e-9
 # A clock that moves by more against the other one was set, it did not drift.
 _CLOCK_JUMP_NS = 500_000_000
 _UNSYNCHRONISED_S = 1.0
+_PORTION = 64
 
 
 class TopicMonitor:
@@ -39,9 +40,31 @@ class TopicMonitor:
         self.first_ns = 0
         self.last_ns = 0
         self.longest_gap_at_ns = 0
+        self._waiting: list[tuple[int, int, int]] = []
+        self._high_ns: int | None = None
         self._intervals = IntervalHistogram()
         self._delays = Sampler()
         self._last_delay_ns: int | None = None
+
+    def take_one(self, stamp_ns: int, log_ns: int, header_ns: int) -> bool:
+        """Look at one message; whether it is later than all before. Not to be mixed with `take`.
+
+        What else there is to see is looked at now and then, for many messages at once.
+        """
+        self._waiting.append((stamp_ns, log_ns, header_ns))
+        later = self._high_ns is None or stamp_ns > self._high_ns
+        if later:
+            self._high_ns = stamp_ns
+        if len(self._waiting) >= _PORTION:
+            self.catch_up()
+        return later
+
+    def catch_up(self) -> None:
+        """Look at what `take_one` put aside."""
+        waiting, self._waiting = self._waiting, []
+        if waiting:
+            stamps, logs, headers = np.array(waiting, dtype=np.int64).T
+            self.take(stamps, logs, headers_ns=headers)
 
     def take(self, stamps_ns: I64, log_ns: I64, *, headers_ns: I64 | None = None) -> Bool:
         """Look at (n,) messages in the order in which they came; which of them are later than all before.
@@ -100,6 +123,7 @@ class TopicMonitor:
 
     def result(self, *, gap_factor: float) -> TopicHealth:
         """What was seen so far; a pause longer than `gap_factor` median intervals is a gap."""
+        self.catch_up()
         period_ns = self._intervals.median_ns
         gaps, gap_ns = self._intervals.longer_than(gap_factor * period_ns) if self.used > 1 else (0, 0.0)
         watched = self.messages > 0
