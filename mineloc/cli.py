@@ -35,7 +35,7 @@ def _root() -> None:  # pyright: ignore[reportUnusedFunction]  # typer keeps sub
 
 @app.command()
 def simulate(
-    mine: Annotated[str, typer.Argument(help="Mesh (.ply .obj .stl .dae), plan (.toml .dxf), or demo, straight, loop.")],
+    mine: Annotated[str, typer.Argument(help="Mesh (.ply .obj .stl .dae), plan (.toml .dxf), or demo|straight|loop.")],
     out: Annotated[Path, typer.Option("--out", help="The flight file to write (.mcap).")],
     length_m: Annotated[float | None, typer.Option("--length-m", help="Path length of the tour.")] = None,
     speed_mps: Annotated[float | None, typer.Option("--speed-mps", help="On straight roadways.")] = None,
@@ -65,6 +65,38 @@ def simulate(
     from mineloc.stages.simulation_table import simulation_table
 
     Console(highlight=False).print(simulation_table(result))
+
+
+@app.command()
+def ingest(
+    recording: Annotated[Path, typer.Argument(help="An .mcap, .bag or .db3 file, or a rosbag2 folder.")],
+    out: Annotated[Path, typer.Option("--out", help="The flight file to write (.mcap).")],
+    sequence: Annotated[
+        Path | None, typer.Option("--sequence", help="What the recording does not say about itself: datasets/x.toml.")
+    ] = None,
+    as_json: JsonOption = False,
+    config: ConfigOption = None,
+    overrides: SetOption = None,
+) -> None:
+    """Make a flight of a recording, recover what is damaged, and say how healthy it is."""
+    from mineloc.config import load_config
+    from mineloc.stages.ingest import ingest as run_stage
+    from mineloc.stages.progress_bar import progress_bar
+
+    settings = load_config(config, overrides or ())
+    with progress_bar("ingest") as progress:
+        result = run_stage(recording, out=out, sequence=sequence, config=settings, progress=progress)
+    if as_json:
+        sys.stdout.write(json.dumps(result.health.to_json_dict(), indent=1, allow_nan=False) + "\n")
+        return
+    from rich.console import Console
+
+    from mineloc.stages.health_table import health_tables
+
+    console = Console(highlight=False)
+    for part in health_tables(result.health):
+        console.print(part)
+    console.print(f"flight: {result.out}", soft_wrap=True, markup=False)
 
 
 @app.command()
@@ -124,6 +156,50 @@ def evaluate(
         console.print(line, soft_wrap=True, markup=False)
     for table in tables(evaluation):
         console.print(table)
+
+
+@app.command()
+def report(
+    runs: Annotated[list[Path], typer.Argument(help="Run folders; several are set side by side.")],
+    out: Annotated[Path, typer.Option("--out", help="The page to write (.html); the same numbers go to .json.")],
+    title: Annotated[str | None, typer.Option("--title", help="Heading of the page.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing page.")] = False,
+    config: ConfigOption = None,
+    overrides: SetOption = None,
+) -> None:
+    """The accuracy report: one HTML file that opens anywhere and prints to A4. E.g. report RUN/ --out report.html."""
+    from mineloc.config import load_config
+    from mineloc.report.page import write_report
+    from mineloc.stages.progress_bar import progress_bar
+
+    settings = load_config(config, overrides or ())
+    with progress_bar("report") as progress:
+        page = write_report(runs, out, config=settings, title=title, overwrite=overwrite, progress=progress)
+    typer.echo(f"{page}\n{page.with_suffix('.json')}")
+
+
+@app.command()
+def view(
+    what: Annotated[Path, typer.Argument(help="A run folder, a flight (.mcap), or a recording (.rrd).")],
+    flight: Annotated[Path | None, typer.Option("--flight", help="The run's flight: its sweeps are shown.")] = None,
+    save: Annotated[Path | None, typer.Option("--save", help="Write the recording (.rrd), open no window.")] = None,
+    screenshot: Annotated[Path | None, typer.Option("--screenshot", help="Write a picture (.png).")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
+    config: ConfigOption = None,
+    overrides: SetOption = None,
+) -> None:
+    """Look at a run or a flight in Rerun: mine, trajectories, sweeps, curves. E.g. view RUN/ --save run.rrd."""
+    from mineloc.config import load_config
+    from mineloc.stages.progress_bar import progress_bar
+    from mineloc.view.show import show
+
+    settings = load_config(config, overrides or ())
+    with progress_bar("view") as progress:
+        written = show(
+            what, flight=flight, save=save, picture=screenshot, overwrite=overwrite, config=settings, progress=progress
+        )
+    for path in written:
+        typer.echo(path)
 
 
 @app.command()

@@ -69,8 +69,7 @@ def record_flight(
             r.moving("map/body", body.stamps_ns, body.poses, axis_m=1.5)
         for curve in curves:
             r.curve(curve.entity, curve.stamps_ns, curve.values, name=curve.name, color=curve.color)
-        for stamp_ns, points in clouds:
-            r.sweep("map/sweep", stamp_ns, points, color=YELLOW, radius_m=0.06)
+        r.sweeps("map/sweep", clouds, color=YELLOW, radius_m=0.06)
     return out
 
 

@@ -6,7 +6,7 @@ centimetres (PLATFORM 3). Clouds are rounded to centimetres, which makes the fil
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -22,6 +22,7 @@ from mineloc.data import F32, F64, I64
 TIMELINE = "time"
 APPLICATION = "mineloc"
 _DECIMALS = 2  # of metres
+_SWEEPS_A_CHUNK = 64
 
 Rgb = tuple[int, int, int]
 
@@ -88,11 +89,23 @@ class RunRecorder:
         )
         self._stream.log(entity, rr.TransformAxes3D(axis_m), static=True)
 
-    def sweep(self, entity: str, stamp_ns: int, points_map: F64 | F32, *, color: Rgb, radius_m: float) -> None:
-        """The points of one sweep, (n, 3) in the map, shown until the next."""
-        self._stream.set_time(TIMELINE, timestamp=np.datetime64(stamp_ns, "ns"))
-        self._stream.log(entity, rr.Points3D(self._rounded(points_map), colors=color, radii=radius_m))
-        self._stream.reset_time()
+    def sweeps(self, entity: str, clouds: Iterable[tuple[int, F64]], *, color: Rgb, radius_m: float) -> None:
+        """Sweeps in order of time, (stamp, (n, 3) points in the map), each shown until the next."""
+        self._stream.log(entity, rr.Points3D.from_fields(colors=color, radii=radius_m), static=True)
+        waiting: list[tuple[int, F32]] = []
+        for stamp_ns, points_map in clouds:
+            waiting.append((stamp_ns, self._rounded(points_map)))
+            if len(waiting) == _SWEEPS_A_CHUNK:
+                self._send(entity, waiting)
+                waiting = []
+        self._send(entity, waiting)
+
+    def _send(self, entity: str, sweeps: list[tuple[int, F32]]) -> None:
+        # columns, not `log`: that would add the time of writing, and equal runs shall give equal recordings
+        if sweeps:
+            columns = rr.Points3D.columns(positions=np.concatenate([points for _, points in sweeps]))
+            stamps = np.array([stamp_ns for stamp_ns, _ in sweeps], dtype=np.int64)
+            self._stream.send_columns(entity, [_times(stamps)], columns.partition([len(p) for _, p in sweeps]))
 
     def curve(self, entity: str, stamps_ns: I64, values: F64, *, name: str, color: Rgb) -> None:
         """A number over time; times without a value (NaN) are left out."""

@@ -84,8 +84,7 @@ def record_run(
             shown = iter(placed.thinned(clouds, config.view))
         else:
             shown = placed.flight_clouds(flight, scene.lidar, config.view, progress=progress)
-        for stamp_ns, points in shown:
-            r.sweep("map/sweep", stamp_ns, points, color=YELLOW, radius_m=0.06)
+        r.sweeps("map/sweep", shown, color=YELLOW, radius_m=0.06)
     return out
 
 

@@ -42,20 +42,29 @@ def open_viewer(recording: Path) -> None:
             raise _no_viewer(recording, log.read())
 
 
-def screenshot(recording: Path, picture: Path, *, at_ns: int, size: tuple[int, int] = (1600, 1000)) -> Path:
+def screenshot(
+    recording: Path,
+    picture: Path,
+    *,
+    at_ns: int | None,
+    size: tuple[int, int] = (1600, 1000),
+    overwrite: bool = False,
+) -> Path:
     """Write a picture (PNG) of what a recording opens on, drawn without a screen.
 
     Args:
         recording: `.rrd`.
         picture: file to write.
-        at_ns: where the time cursor stands.
+        at_ns: where the time cursor stands; None leaves it where the recording opens.
         size: width and height in points; the picture may have more pixels.
+        overwrite: replace `picture`.
 
     Raises:
         OutputError: no graphics driver, the viewer did not answer, or the picture cannot be written.
     """
-    with new_file(picture) as temp, _headless(recording, size) as client:
-        client.set_time(TIMELINE, timestamp=np.datetime64(at_ns, "ns"), play_state="paused")
+    with new_file(picture, overwrite=overwrite) as temp, _headless(recording, size) as client:
+        if at_ns is not None:
+            client.set_time(TIMELINE, timestamp=np.datetime64(at_ns, "ns"), play_state="paused")
         before = b""
         # Chunks of the recording arrive one by one; the picture is done when it does not change any more.
         for _ in range(_TRIES):

@@ -1,0 +1,78 @@
+"""What `mineloc view` does: make a recording of whatever is named, then keep it, picture it, or open a window."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from rerun.chunk import RrdReader
+
+from mineloc.config import Config
+from mineloc.errors import FormatError
+from mineloc.progress import Progress, quiet
+from mineloc.view.flight import record_flight
+from mineloc.view.recorder import TIMELINE
+from mineloc.view.run import record_run
+from mineloc.view.viewer import open_viewer, screenshot
+
+
+def show(
+    what: Path,
+    *,
+    flight: Path | None = None,
+    save: Path | None = None,
+    picture: Path | None = None,
+    overwrite: bool = False,
+    config: Config,
+    progress: Progress = quiet,
+) -> list[Path]:
+    """Record and show; a window opens only when neither `save` nor `picture` is wanted.
+
+    Args:
+        what: a run folder, a canonical flight (.mcap), or a recording (.rrd).
+        flight: the flight of a run, for its sweeps.
+        save: where to keep the recording.
+        picture: where to write a picture of it, half way through the flight.
+        overwrite: replace `save` and `picture`.
+        config: sections `view` and `evaluate`.
+        progress: told the sweeps that are done.
+
+    Returns:
+        The files that were written.
+
+    Raises:
+        FormatError: none of the three kinds.
+        MinelocError: what recording and viewer say.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        recording = _recording(what, flight, save or Path(folder) / "view.rrd", overwrite, config, progress)
+        if picture is not None:
+            screenshot(recording, picture, at_ns=_middle_ns(recording), overwrite=overwrite)
+        if save is None and picture is None:
+            open_viewer(recording)
+    return [path for path in (save, picture) if path is not None]
+
+
+def _recording(what: Path, flight: Path | None, out: Path, overwrite: bool, config: Config, progress: Progress) -> Path:
+    if what.is_dir():
+        return record_run(what, out, flight=flight, config=config, overwrite=overwrite, progress=progress)
+    if not what.exists():
+        raise FormatError(what, "no such file or folder", todo="check the path")
+    if flight is not None:
+        raise FormatError(what, "is no run folder", expected="a run folder with --flight", todo="leave out --flight")
+    if what.suffix == ".mcap":
+        return record_flight(what, out, config=config, overwrite=overwrite, progress=progress)
+    if what.suffix == ".rrd":
+        return what
+    raise FormatError(what, "cannot be shown", expected="a run folder, a flight (.mcap) or a recording (.rrd)")
+
+
+def _middle_ns(recording: Path) -> int | None:
+    """Half way between the first and the last time of a recording; None when it is not one of ours."""
+    times: list[int] = []
+    for chunk in RrdReader(recording).stream():
+        if TIMELINE in chunk.timeline_names and chunk.num_rows:
+            stamps = np.asarray(chunk.to_record_batch().column(TIMELINE)).astype(np.int64)
+            times += [int(stamps.min()), int(stamps.max())]
+    return (min(times) + max(times)) // 2 if times else None
