@@ -28,7 +28,10 @@ def read_collada(path: Path) -> tuple[F64, I64]:
         return _Document(root).triangles()
     except (ElementTree.ParseError, UnicodeDecodeError, KeyError, IndexError, ValueError, RecursionError) as error:
         raise FormatError(
-            path, f"not a COLLADA mesh ({type(error).__name__}: {error})", expected="COLLADA 1.4", todo="export it again"
+            path,
+            f"not a COLLADA mesh ({type(error).__name__}: {error})",
+            expected="COLLADA 1.4",
+            todo="export it again",
         ) from None
 
 

@@ -36,7 +36,9 @@ def drone_motion(
     positions = _sway(plan, scene, sway_m, clearance_m, rng)
     level = np.zeros((len(positions), 2))
     control = np.column_stack([positions, plan.yaw_rad, level])
-    smooth = Motion(control, plan.step_s, Vibration.none()).at(np.arange(len(positions)) * plan.step_s)
+    smooth = Motion(control, plan.step_s, Vibration.none()).at(
+        np.linspace(0.0, (len(positions) - 1) * plan.step_s, len(positions))
+    )
     # the air resists in proportion to the speed: a drone in level flight leans forward
     force = smooth.accel_mps2 + DRAG_PER_S * smooth.velocity_mps
     control[:, 4], control[:, 5] = tilt_from_thrust(force, plan.yaw_rad)

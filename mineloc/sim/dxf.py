@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import ezdxf
 import numpy as np
 from ezdxf import path as dxf_path
 from ezdxf import units
+from ezdxf.enums import InsertUnits
+from ezdxf.filemanagement import readfile
+from ezdxf.lldxf.const import DXFError
 
 from mineloc.errors import FormatError
 from mineloc.sim.plan import MinePlan, RoadwayPlan
@@ -30,12 +32,12 @@ def read_dxf(path: Path, *, width_m: float, height_m: float) -> MinePlan:
         FormatError: not a DXF file, or no line in it.
     """
     try:
-        drawing = ezdxf.readfile(path)
-    except (OSError, ezdxf.DXFError, UnicodeDecodeError, ValueError) as error:
+        drawing = readfile(path)
+    except (OSError, DXFError, UnicodeDecodeError, ValueError) as error:
         raise FormatError(
             path, f"not a DXF file ({' '.join(str(error).split())})", expected="DXF", todo="export it again"
         ) from None
-    scale = units.conversion_factor(units.InsertUnits(drawing.units), units.InsertUnits.Meters) if drawing.units else 1.0
+    scale = units.conversion_factor(InsertUnits(drawing.units), InsertUnits.Meters) if drawing.units else 1.0
     hidden = {layer.dxf.name.lower() for layer in drawing.layers if layer.is_off() or layer.is_frozen()}
     roads: list[RoadwayPlan] = []
     for entity in drawing.modelspace():
@@ -60,6 +62,8 @@ def _points(entity: Any, scale: float) -> tuple[tuple[float, float, float], ...]
     except (TypeError, ValueError):
         # meshes hide among POLYLINEs; they are no centre-lines
         return ()
-    points = np.array([vertex.xyz for vertex in line.flattening(SAG_M / scale)], dtype=np.float64).reshape(-1, 3) * scale
+    points = (
+        np.array([vertex.xyz for vertex in line.flattening(SAG_M / scale)], dtype=np.float64).reshape(-1, 3) * scale
+    )
     moved = np.concatenate([[True], np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-6]) if len(points) else []
     return tuple((float(x), float(y), float(z)) for x, y, z in points[np.asarray(moved, dtype=bool)])

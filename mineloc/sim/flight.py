@@ -18,10 +18,11 @@ from mineloc.sim.machine import Machine, in_front
 from mineloc.sim.mine import Mine
 from mineloc.sim.motion import Vibration
 from mineloc.sim.path import fly_line, passable
+from mineloc.sim.roadways import RoadwayGraph
 from mineloc.sim.scene import Scene
 from mineloc.sim.schedule import Limits, schedule
 from mineloc.sim.shots import RangeErrors, Returns, Shots, aim, firings_of, measure
-from mineloc.sim.tour import plan_tour
+from mineloc.sim.tour import Step, plan_tour
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -77,6 +78,7 @@ class SimulatedFlight:
         # rounding corners and blind ends shortens the line by some percent
         self.tour = plan_tour(self.graph, config.length_m * 1.15 + 20.0, _rng(config.seed, _TOUR), start=start)
         legs = cut(fly_line(self.graph, self.tour, scene, clearance_m=clearance), config.length_m)
+        self.tour = _flown(self.graph, self.tour, config.length_m)
         check_enclosed(scene, legs[0])
         limits = Limits(config.speed_mps, config.accel_mps2, np.deg2rad(config.yaw_rate_degps), config.hover_s)
         vibration = Vibration.of_rotors(
@@ -105,7 +107,7 @@ class SimulatedFlight:
 
     def pose(self, stamps_ns: I64) -> F64:
         """(n, 4, 4) true `T_map_body` at any times of the flight."""
-        return self.motion.pose((stamps_ns - START_NS) * 1e-9)
+        return self.motion.pose((stamps_ns - START_NS).astype(np.float64) * 1e-9)
 
     def packets(self) -> Iterator[Packet]:
         """The flight, one revolution after the other; the same every time it is asked for."""
@@ -167,6 +169,12 @@ def _rng(*key: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(key))
 
 
+def _flown(graph: RoadwayGraph, tour: list[Step], length_m: float) -> list[Step]:
+    """The steps of a tour that begin before its cut."""
+    begin = np.concatenate([[0.0], np.cumsum([graph.roadways[step.roadway].length_m for step in tour])])
+    return [step for step, at in zip(tour, begin[:-1], strict=True) if at < length_m]
+
+
 def _imu_noise(config: SimulateConfig) -> ImuNoise:
     return ImuNoise(
         gyro_density=np.deg2rad(config.gyro_noise_degps_rthz),
@@ -202,7 +210,10 @@ def check_enclosed(scene: Scene, line_m: F64) -> None:
     met = np.isfinite(scene.ranges_m(origins, np.tile(around, (len(points), 1)))).mean()
     if met < 0.5:
         raise SimulationError(
-            "mine", f"open in {1 - met:.0%} of all directions", expected="walls around the roadways", todo="check the mesh"
+            "mine",
+            f"open in {1 - met:.0%} of all directions",
+            expected="walls around the roadways",
+            todo="check the mesh",
         )
 
 

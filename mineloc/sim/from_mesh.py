@@ -63,7 +63,7 @@ def roadways_of_mesh(
 
 
 def _check_scale(scene: Scene, low_m: F64, high_m: F64, cell_m: float, where: str) -> None:
-    """Refuse before the fine grid: gaps as high as a tower mean centimetres, and no memory holds the plan of a county."""
+    """Refuse before the fine grid: gaps as high as towers mean centimetres; no memory holds the plan of a county."""
     columns, rows = np.meshgrid(*(np.linspace(low_m[k], high_m[k], SAMPLES + 2)[1:-1] for k in range(2)))
     start = np.column_stack([columns.ravel(), rows.ravel(), np.full(columns.size, low_m[2] - 1.0)])
     crossings = scene.verticals(start)
@@ -213,11 +213,12 @@ class _Net:
 
     def _keep_largest(self) -> None:
         """Ledges and slivers of the sheet can leave pieces that hang together with nothing else."""
-        net = nx.MultiGraph([(edge.a, edge.b, {"edge": edge}) for edge in self.edges])
-        parts = [
-            [edge for _, _, edge in net.edges(nodes, data="edge")] for nodes in map(sorted, nx.connected_components(net))
-        ]
-        self.edges = max(parts, key=lambda edges: sum(edge.length_m for edge in edges), default=[])
+        net = nx.Graph([(edge.a, edge.b) for edge in self.edges])
+        part_of = {node: k for k, nodes in enumerate(nx.connected_components(net)) for node in nodes}
+        length = [0.0] * (max(part_of.values(), default=-1) + 1)
+        for edge in self.edges:
+            length[part_of[edge.a]] += edge.length_m
+        self.edges = [edge for edge in self.edges if length[part_of[edge.a]] == max(length)]
 
     def _degrees(self) -> dict[int, int]:
         out: dict[int, int] = {}

@@ -42,7 +42,7 @@ def ideal_imu(state: Kinematics, T_body_imu: F64) -> tuple[F64, F64]:
     """
     lever = T_body_imu[:3, 3]
     omega, alpha = state.rate_radps, state.rate_change_radps2
-    force_map = state.accel_mps2 + [0.0, 0.0, GRAVITY_MPS2]
+    force_map = state.accel_mps2 + np.array([0.0, 0.0, GRAVITY_MPS2])
     force = np.einsum("nji,nj->ni", state.T_map_body[:, :3, :3], force_map)
     force += np.cross(alpha, lever) + np.cross(omega, np.cross(omega, lever))
     R = T_body_imu[:3, :3]
@@ -62,7 +62,14 @@ class Imu:
     """
 
     def __init__(
-        self, motion: Motion, T_body_imu: F64, noise: ImuNoise, *, rate_hz: float, start_ns: int, rng: np.random.Generator
+        self,
+        motion: Motion,
+        T_body_imu: F64,
+        noise: ImuNoise,
+        *,
+        rate_hz: float,
+        start_ns: int,
+        rng: np.random.Generator,
     ) -> None:
         self._motion = motion
         self._T_body_imu = T_body_imu
@@ -81,7 +88,7 @@ class Imu:
         if not len(index):
             return ImuSamples.empty()
         since_ns = index * self._period_ns
-        gyro, accel = ideal_imu(self._motion.at(since_ns * 1e-9), self._T_body_imu)
+        gyro, accel = ideal_imu(self._motion.at(np.asarray(since_ns * 1e-9, np.float64)), self._T_body_imu)
         errors = self._errors(len(index))
         return ImuSamples(self._start_ns + since_ns, gyro + errors[:, :3], accel + errors[:, 3:])
 
@@ -102,4 +109,3 @@ def mounting(roll_deg: float, pitch_deg: float, yaw_deg: float, offset_m: tuple[
     T = se3.exp(np.concatenate([rotvec, np.zeros(3)]))
     T[:3, 3] = offset_m
     return T
-

@@ -91,7 +91,7 @@ def _vlp16() -> LidarModel:
         azimuth_rad=np.zeros(16),
         height_m=height_mm * 1e-3,
         radius_m=0.0,
-        fire_s=np.arange(16) * 2.304e-6,
+        fire_s=_steps(16, 2.304e-6),
         firing_s=55.296e-6,
         columns=0,
         min_range_m=0.5,
@@ -112,7 +112,7 @@ def _hdl32e() -> LidarModel:
         azimuth_rad=np.zeros(32),
         height_m=np.zeros(32),
         radius_m=0.0,
-        fire_s=np.arange(32) * 1.152e-6,
+        fire_s=_steps(32, 1.152e-6),
         firing_s=46.08e-6,
         columns=0,
         min_range_m=0.9,
@@ -132,7 +132,7 @@ def _rs16() -> LidarModel:
         azimuth_rad=np.zeros(16),
         height_m=np.zeros(16),
         radius_m=0.038,
-        fire_s=np.arange(16) * 2.8e-6,
+        fire_s=_steps(16, 2.8e-6),
         firing_s=55.5e-6,
         columns=0,
         min_range_m=0.4,
@@ -162,3 +162,7 @@ def _os0() -> LidarModel:
         sigma_m=0.02,
         range_10_percent_m=35.0,
     )
+
+
+def _steps(count: int, step_s: float) -> F64:
+    return np.linspace(0.0, (count - 1) * step_s, count)

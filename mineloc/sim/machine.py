@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from mineloc.compiled import njit
 from mineloc.sim.motion import Motion
 from mineloc.sim.scene import Hits, Scene
 

@@ -31,7 +31,9 @@ def read_mesh(path: Path) -> tuple[F64, I64]:
         raise FormatError(path, "no such file", expected="a mesh file", todo="check the path")
     vertices, triangles = read_collada(path) if path.suffix.lower() == ".dae" else _read_open3d(path)
     if not len(triangles):
-        raise SimulationError(path, "no triangles", expected="a surface", todo="export the mine as triangles, not points")
+        raise SimulationError(
+            path, "no triangles", expected="a surface", todo="export the mine as triangles, not points"
+        )
     if not np.isfinite(vertices).all():
         raise SimulationError(path, "vertices that are not finite", expected="numbers", todo="repair the mesh")
     corners = vertices[triangles]
@@ -47,10 +49,13 @@ def _read_open3d(path: Path) -> tuple[F64, I64]:
             if file.read(3) != b"ply":
                 raise FormatError(path, "not a PLY file", expected="a mesh", todo="check the file")
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        mesh = o3d.io.read_triangle_mesh(str(path))
+        mesh = o3d.io.read_triangle_mesh(path)
     if mesh.is_empty():
         raise FormatError(
-            path, "cannot be read as a mesh", expected=f"a whole {path.suffix} file", todo="check the file or export it again"
+            path,
+            "cannot be read as a mesh",
+            expected=f"a whole {path.suffix} file",
+            todo="check the file or export it again",
         )
     return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.triangles, dtype=np.int64)
 

@@ -80,7 +80,7 @@ def mid_height(floor_m: F64, scene: Scene) -> F64:
     Raises:
         SimulationError: no floor or no roof at some point.
     """
-    probe = floor_m + [0.0, 0.0, 1.0]
+    probe = floor_m + np.array([0.0, 0.0, 1.0])
     down = scene.ranges_m(probe, [0.0, 0.0, -1.0])
     up = scene.ranges_m(probe, [0.0, 0.0, 1.0])
     known = np.isfinite(down) & np.isfinite(up)

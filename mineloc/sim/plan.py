@@ -1,9 +1,10 @@
-"""Mine plans: centre-lines with widths and heights, from TOML or from the code, and the roadway graph that they make."""
+"""Mine plans: centre-lines with widths and heights, from TOML or from code, and the roadway graph that they make."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -154,7 +155,7 @@ def _pieces(cut: _Cuts, shortest_m: float) -> list[F64]:
             places.append(at)
     if len(places) == 1 or length - places[-1] > 0:
         places = [*(places[:-1] if len(places) > 1 else places), length]
-    return [_between(cut, a, b) for a, b in zip(places[:-1], places[1:], strict=True)]
+    return [_between(cut, a, b) for a, b in pairwise(places)]
 
 
 def _between(cut: _Cuts, a: float, b: float) -> F64:

@@ -77,7 +77,15 @@ def read_graph(path: Path, *, floor_z_m: float = 0.0) -> RoadwayGraph:
         index = {node["id"]: k for k, node in enumerate(raw["nodes"])}
         nodes = np.array([_xyz(node.get("xyz", node.get("xy")), floor) for node in raw["nodes"]])
         roads = tuple(_roadway(edge, index, nodes, floor) for edge in raw["edges"])
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, ValueError, AttributeError) as error:
+    except (
+        OSError,
+        UnicodeDecodeError,
+        json.JSONDecodeError,
+        KeyError,
+        TypeError,
+        ValueError,
+        AttributeError,
+    ) as error:
         raise FormatError(
             path, f"not a roadway graph ({error})", expected="JSON with nodes and edges", todo="correct the file"
         ) from None

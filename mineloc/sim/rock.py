@@ -8,10 +8,12 @@ mean of the crossings of its edges; one quadrilateral an edge.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from mineloc.compiled import njit
 from mineloc.sim.plan import MinePlan
 
 F64 = NDArray[np.float64]
@@ -34,7 +36,9 @@ def rock_mesh(plan: MinePlan) -> tuple[F64, I64]:
     for block in blocks:
         low = block * BLOCK * plan.cell_m
         near = _near(segments, low, BLOCK * plan.cell_m)
-        field = _field(segments[near], octaves, block * BLOCK - 1, BLOCK + 2, plan.cell_m, plan.roughness.floor, plan.seed)
+        field = _field(
+            segments[near], octaves, block * BLOCK - 1, BLOCK + 2, plan.cell_m, plan.roughness.floor, plan.seed
+        )
         key, vertex, quad = _surface_nets(field, block * BLOCK - 1, plan.cell_m)
         keys.append(key)
         vertices.append(vertex)
@@ -51,7 +55,7 @@ def _segments(plan: MinePlan) -> F64:
     for road in plan.roadway:
         line = road.line_m
         profile = np.array([road.width_m / 2, road.height_m, road.height_m * (1 - road.arch)])
-        rows += [np.concatenate([a, b, profile]) for a, b in zip(line[:-1], line[1:], strict=True)]
+        rows += [np.concatenate([a, b, profile]) for a, b in pairwise(line)]
     return np.array(rows)
 
 
@@ -80,8 +84,8 @@ def _blocks(segments: F64, plan: MinePlan) -> I64:
         count = max(2, int(np.ceil(np.linalg.norm(b - a) / (size / 2))) + 1)
         points = a + np.linspace(0, 1, count)[:, None] * (b - a)
         step = np.abs(b - a) / (count - 1)
-        low = np.floor((points - [half, half, 0] - margin - step) / size).astype(np.int64)
-        high = np.floor((points + [half, half, height] + margin + step) / size).astype(np.int64)
+        low = np.floor((points - np.array([half, half, 0.0]) - margin - step) / size).astype(np.int64)
+        high = np.floor((points + np.array([half, half, height]) + margin + step) / size).astype(np.int64)
         for one, other in zip(low, high, strict=True):
             axes = [np.arange(one[k], other[k] + 1) for k in range(3)]
             found.append(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
@@ -94,7 +98,7 @@ def _near(segments: F64, low_m: F64, size_m: float) -> NDArray[np.bool_]:
     a, b = segments[:, :3], segments[:, 3:6]
     box_low = np.minimum(a, b) - np.concatenate([half, half, np.full_like(half, 2.0)], axis=1)
     box_high = np.maximum(a, b) + np.concatenate([half, half, segments[:, 7:8] + 2.0], axis=1)
-    return ((box_low <= low_m + size_m) & (box_high >= low_m)).all(axis=1)
+    return np.all((box_low <= low_m + size_m) & (box_high >= low_m), axis=1)
 
 
 @njit(cache=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import open3d as o3d
@@ -59,13 +60,13 @@ class Scene:
         self._upward: F64 = normals[:, 2] / np.maximum(np.linalg.norm(normals, axis=1), 1e-30)
         self._scene = o3d.t.geometry.RaycastingScene(nthreads=threads)
         self._scene.add_triangles(
-            o3d.core.Tensor(np.ascontiguousarray(vertices - self.origin_m, dtype=np.float32)),
-            o3d.core.Tensor(np.ascontiguousarray(triangles, dtype=np.uint32)),
+            _tensor(np.ascontiguousarray(vertices - self.origin_m, dtype=np.float32)),
+            _tensor(np.ascontiguousarray(triangles, dtype=np.uint32)),
         )
 
     def cast(self, rays: F32) -> Hits:
         """First hits of (n, 6) float32 rays `[origin - origin_m, unit direction]`."""
-        found = self._scene.cast_rays(o3d.core.Tensor(rays))
+        found = self._scene.cast_rays(_tensor(rays))
         return Hits(found["t_hit"].numpy(), found["primitive_normals"].numpy())
 
     def ranges_m(self, origins_m: F64, directions: ArrayLike) -> F64:
@@ -76,7 +77,7 @@ class Scene:
 
     def nearest_m(self, points_m: F64) -> F64:
         """(n, 3) nearest point of the mesh for each of (n, 3) points."""
-        query = o3d.core.Tensor(np.ascontiguousarray(points_m - self.origin_m, dtype=np.float32))
+        query = _tensor(np.ascontiguousarray(points_m - self.origin_m, dtype=np.float32))
         found = self._scene.compute_closest_points(query)["points"].numpy()
         return found.astype(np.float64) + self.origin_m
 
@@ -88,8 +89,13 @@ class Scene:
         """All surfaces that rays straight up from (n, 3) origins cross, in rising order for each ray."""
         local = origins_m - self.origin_m
         rays = np.concatenate([local, np.broadcast_to([0.0, 0.0, 1.0], local.shape)], axis=1)
-        found = self._scene.list_intersections(o3d.core.Tensor(np.ascontiguousarray(rays, dtype=np.float32)))
+        found = self._scene.list_intersections(_tensor(np.ascontiguousarray(rays, dtype=np.float32)))
         ray = found["ray_ids"].numpy().astype(np.int64)
         height = found["t_hit"].numpy().astype(np.float64)
         order = np.lexsort((height, ray))
         return Crossings(ray[order], height[order], self._upward[found["primitive_ids"].numpy()[order]])
+
+
+def _tensor(values: NDArray[Any]) -> Any:
+    # open3d's own stubs do not know that numpy arrays are accepted
+    return o3d.core.Tensor(values)  # pyright: ignore[reportCallIssue]

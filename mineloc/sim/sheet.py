@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from mineloc.compiled import njit
 from mineloc.sim.scene import Scene
 
 F64 = NDArray[np.float64]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from mineloc.compiled import njit
 from mineloc.sim.lidar import LidarModel
 from mineloc.sim.scene import Hits
 
@@ -43,8 +43,9 @@ def firings_of(lidar: LidarModel, revolution: int, rate_hz: float) -> Firings:
         # counted in whole picoseconds: the number of firings must not depend on rounding
         period_ps, turn_ps = round(period * 1e12), round(1e12 / rate_hz)
         index = np.arange(-(-revolution * turn_ps // period_ps), -(-(revolution + 1) * turn_ps // period_ps))
-    time = index * period
-    return Firings(time, np.pi - 2 * np.pi * ((time * rate_hz) % 1.0))
+    time = index.astype(np.float64) * np.float64(period)
+    turned = np.mod(time * rate_hz, 1.0)
+    return Firings(time, np.pi - 2 * np.pi * turned)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,9 +168,7 @@ class Returns:
     intensity: F32
 
 
-def measure(
-    lidar: LidarModel, shots: Shots, hits: Hits, errors: RangeErrors, rng: np.random.Generator
-) -> Returns:
+def measure(lidar: LidarModel, shots: Shots, hits: Hits, errors: RangeErrors, rng: np.random.Generator) -> Returns:
     """Ranges with noise, quantisation and drop-outs.
 
     A shot returns with probability 1 / (1 + s⁻⁴), s = (ρ/0.1) cos θ (R₁₀/r)²: half of the shots on a 10 % reflector at
@@ -243,7 +242,7 @@ def _measure(
         if nearest <= r <= farthest:
             seen[i] = True
             ranges[i] = r
-            intensity[i] = np.rint(min(max(255.0 * reflectivity * cosine ** 0.5, 0.0), 255.0))
+            intensity[i] = np.rint(min(max(255.0 * reflectivity * cosine**0.5, 0.0), 255.0))
     return seen, ranges, intensity
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from mineloc.compiled import njit
 from mineloc.sim.sheet import Sheet, components
 
 F64 = NDArray[np.float64]
@@ -92,9 +93,7 @@ def trace(sheet: Sheet, alive: Bool) -> Skeleton:
     chain_of = _numbered(links, ~branching)
     by_chain = np.argsort(chain_of, kind="stable")
     first = np.searchsorted(chain_of[by_chain], np.arange(int(chain_of.max(initial=-1)) + 2))
-    chains = [
-        _chain(by_chain[a:b], links, chain_of, junction_of, cells) for a, b in zip(first[:-1], first[1:], strict=True)
-    ]
+    chains = [_chain(by_chain[a:b], links, chain_of, junction_of, cells) for a, b in pairwise(first)]
     return Skeleton(junctions, chains)
 
 
@@ -123,7 +122,9 @@ def _chain(members: I64, links: I32, chain_of: I64, junction_of: I64, cells: I64
             break
         row.append(ahead[0])
         seen.add(ahead[0])
-    touched = [[int(junction_of[j]) for j in links[cell] if j >= 0 and junction_of[j] >= 0] for cell in (row[0], row[-1])]
+    touched = [
+        [int(junction_of[j]) for j in links[cell] if j >= 0 and junction_of[j] >= 0] for cell in (row[0], row[-1])
+    ]
     if len(row) == 1:
         both = touched[0]
         touched = [both[:1], both[1:2]]

@@ -24,7 +24,9 @@ class Step:
     forward: bool
 
 
-def plan_tour(graph: RoadwayGraph, length_m: float, rng: np.random.Generator, *, start: int | None = None) -> list[Step]:
+def plan_tour(
+    graph: RoadwayGraph, length_m: float, rng: np.random.Generator, *, start: int | None = None
+) -> list[Step]:
     """Roadways one after the other, at least `length_m` long in all.
 
     At each node the least-visited roadway is next, by chance among equals; the drone turns round only at an end.
@@ -70,7 +72,10 @@ class _Walk:
         self.at_node = graph.at_node()
         if not 0 <= node < len(self.at_node) or not self.at_node[node]:
             raise SimulationError(
-                "--start", f"node {node}", expected=f"0 ... {len(self.at_node) - 1}", todo="choose a node with a roadway"
+                "--start",
+                f"node {node}",
+                expected=f"0 ... {len(self.at_node) - 1}",
+                todo="choose a node with a roadway",
             )
         self.node = node
         self.visits = np.zeros(len(graph.roadways), np.int64)
@@ -79,9 +84,7 @@ class _Walk:
         self.net = nx.MultiGraph()
         for index, road in enumerate(graph.roadways):
             self.net.add_edge(road.a, road.b, key=index, length=road.length_m)
-        self.reachable = [
-            index for index, road in enumerate(graph.roadways) if nx.has_path(self.net, node, road.a)
-        ]
+        self.reachable = [index for index, road in enumerate(graph.roadways) if nx.has_path(self.net, node, road.a)]
 
     def go(self, step: Step) -> None:
         road = self.graph.roadways[step.roadway]

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
-from mineloc.config import IngestConfig, SimulateConfig
+import numpy as np
+
+from mineloc.config import Config
 from mineloc.io.flight import FlightWriter
 from mineloc.progress import Progress, quiet
 from mineloc.sim.flight import SimulatedFlight
@@ -17,34 +20,38 @@ class SimulateResult:
     """What was flown.
 
     Attributes:
-        flight: the file.
-        sweeps: written, lost ones not counted.
-        points: in all sweeps.
+        out: the flight file.
+        sweeps, points: written; lost sweeps are not counted.
         path_m: length of the true path.
-        duration_s: from the first sample to the last.
-        roadways_seen, roadways: how many different roadways of the mine the tour takes.
+        duration_s: of the flight.
+        roadways_m: length of all roadways of the mine.
         intersections: of the mine.
+        roadways_seen, roadways: how many of the roadways that a drone fits through the tour takes, and how many there
+            are.
     """
 
-    flight: Path
+    out: Path
     sweeps: int
     points: int
     path_m: float
     duration_s: float
+    roadways_m: float
+    intersections: int
     roadways_seen: int
     roadways: int
-    intersections: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {**asdict(self), "out": str(self.out)}
 
 
 def simulate(
     mine: str | Path,
-    out: Path,
-    config: SimulateConfig,
     *,
-    ingest: IngestConfig = IngestConfig(),
+    out: Path,
     graph: Path | None = None,
     start: int | None = None,
-    overwrite: bool = False,
+    config: Config | None = None,
     progress: Progress = quiet,
 ) -> SimulateResult:
     """Fly a tour through a mine; the file appears whole or not at all.
@@ -52,11 +59,9 @@ def simulate(
     Args:
         mine: a mesh (.ply .obj .stl .dae), a plan (.toml .dxf) or a built-in name.
         out: the flight file.
-        config: tour, drone, sensors and their errors.
-        ingest: how flight files are compressed.
         graph: roadway graph (JSON) of a mesh, instead of the one found in it.
         start: node of the roadway graph to start from.
-        overwrite: replace an existing file.
+        config: tour, drone, sensors and their errors in `simulate`.
         progress: told after each sweep.
 
     Raises:
@@ -64,23 +69,17 @@ def simulate(
         FormatError, ConfigError: the mine's file is not what it claims.
         OutputError: the flight cannot be written.
     """
+    settings = (config or Config()).simulate
     site = load_mine(
         mine,
         graph=graph,
-        roadway_width_m=config.roadway_width_m,
-        roadway_height_m=config.roadway_height_m,
+        roadway_width_m=settings.roadway_width_m,
+        roadway_height_m=settings.roadway_height_m,
     )
-    flight = SimulatedFlight(site, config, start=start)
+    flight = SimulatedFlight(site, settings, start=start)
     sweeps = points = 0
-    path_m = 0.0
-    with FlightWriter(
-        out,
-        flight.info,
-        flight.calibration,
-        compression=ingest.compression,
-        chunk_bytes=ingest.chunk_bytes,
-        overwrite=overwrite,
-    ) as writer:
+    path_m, last_m = 0.0, flight.motion.pose(np.zeros(1))[0, :3, 3]
+    with FlightWriter(out, flight.info, flight.calibration) as writer:
         for done, packet in enumerate(flight.packets(), start=1):
             if packet.sweep is not None:
                 writer.add_sweep(packet.sweep)
@@ -88,16 +87,18 @@ def simulate(
                 points += len(packet.sweep)
             writer.add_imu(packet.imu)
             writer.add_reference(packet.truth)
-            path_m += float(packet.truth.path_m[-1])
+            line_m = np.vstack([last_m, packet.truth.positions_m])
+            path_m += float(np.linalg.norm(np.diff(line_m, axis=0), axis=1).sum())
+            last_m = line_m[-1]
             progress(done, flight.sweeps, "sweeps")
-    seen = {step.roadway for step in flight.tour}
     return SimulateResult(
-        out,
-        sweeps,
-        points,
-        path_m,
-        flight.sweeps / config.lidar_hz,
-        len(seen),
-        len(site.graph.roadways),
-        len(site.graph.intersections),
+        out=out,
+        sweeps=sweeps,
+        points=points,
+        path_m=path_m,
+        duration_s=flight.sweeps / settings.lidar_hz,
+        roadways_m=site.graph.length_m,
+        intersections=len(site.graph.intersections),
+        roadways_seen=len({step.roadway for step in flight.tour}),
+        roadways=len(flight.graph.roadways),
     )
