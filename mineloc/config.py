@@ -171,7 +171,7 @@ class GraphConfig(Section):
     robust: bool = Field(default=True, description="Cauchy kernel on fixes and loops")
     cauchy_k: float = Field(default=1.0, gt=0, description="in standard deviations of a residual component")
     max_iterations: int = Field(default=100, ge=1)
-    relinearize_threshold: float = Field(default=0.05, gt=0, description="metres or radians; causal estimate")
+    relinearize_threshold: float = Field(default=0.01, gt=0, description="metres or radians; causal estimate")
 
 
 class EvaluateConfig(Section):

@@ -3,45 +3,67 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from mineloc import se3
 from mineloc.data import F64, I64, Trajectory
 
 
-def spread(odometry: Trajectory, keyframe_stamps_ns: I64, keyframe_poses: F64) -> Trajectory:
-    """Correct every odometry pose by the keyframes around it, without jumps.
+def smoothed_trajectory(odometry: Trajectory, keyframe_stamps_ns: I64, T_map_lidar: F64) -> Trajectory:
+    """Lay the odometry between the keyframes, without jumps.
 
-    A pose is carried by relative odometry from the keyframe before and from the one after, and blended by its time
-    between them; at a keyframe it is the keyframe's. Before the first and after the last, one of them counts alone.
+    Between two keyframes the motion that odometry saw is carried on from the earlier and back from the later one; the
+    pose goes over from the first to the second with the time. At a keyframe it is that keyframe's pose. Before the
+    first and after the last there is only one to lean on.
 
     Args:
-        odometry: `T_odom_lidar` of the sweeps.
-        keyframe_stamps_ns: (k,) rising, k ≥ 1, each a stamp of `odometry`.
-        keyframe_poses: (k, 4, 4) corrected `T_map_lidar`.
+        odometry: `T_odom_lidar` of every sweep; every keyframe is one of them.
+        keyframe_stamps_ns: (k,) strictly increasing.
+        T_map_lidar: (k, 4, 4) corrected poses.
 
     Returns:
-        `T_map_lidar` at the stamps of `odometry`.
+        `T_map_lidar` of every sweep.
 
     Raises:
-        ValueError: no keyframes, or a keyframe that is no pose of the odometry.
+        ValueError: no keyframes, or a keyframe that is no sweep.
     """
-    at = np.searchsorted(odometry.stamps_ns, keyframe_stamps_ns)
-    if not len(at) or at[-1] >= len(odometry) or bool((odometry.stamps_ns[at] != keyframe_stamps_ns).any()):
-        raise ValueError("every keyframe must be a pose of the odometry")
-    after = np.searchsorted(keyframe_stamps_ns, odometry.stamps_ns, side="left")
-    before = np.clip(after - 1, 0, len(at) - 1)
-    after = np.clip(after, 0, len(at) - 1)
-    # T_map_odom of each keyframe; applied to the sweep's own pose it carries the relative motion along
-    corrections = keyframe_poses @ se3.inverse(odometry.poses[at])
-    from_before, from_after = corrections[before] @ odometry.poses, corrections[after] @ odometry.poses
-    gap = np.maximum(keyframe_stamps_ns[after] - keyframe_stamps_ns[before], 1)
-    u = np.clip((odometry.stamps_ns - keyframe_stamps_ns[before]) / gap, 0.0, 1.0)
-    return Trajectory(odometry.stamps_ns, _blend(from_before, from_after, u), parent="map", child=odometry.child)
+    row = _rows(odometry, keyframe_stamps_ns, T_map_lidar)
+    correction = T_map_lidar @ se3.inverse(odometry.poses[row])
+    sweep = np.arange(len(odometry))
+    before = np.clip(np.searchsorted(row, sweep, side="right") - 1, 0, len(row) - 1)
+    after = np.minimum(before + 1, len(row) - 1)
+    forward = correction[before] @ odometry.poses
+    backward = correction[after] @ odometry.poses
+    t, begin, end = odometry.stamps_ns, keyframe_stamps_ns[before], keyframe_stamps_ns[after]
+    share = np.clip((t - begin) / np.maximum(end - begin, 1), 0.0, 1.0)
+    poses = forward @ se3.exp(share[:, None] * se3.log(se3.inverse(forward) @ backward))
+    return Trajectory(t, poses, parent="map", child=odometry.child)
 
 
-def _blend(a: F64, b: F64, u: F64) -> F64:
-    """Poses (n, 4, 4) a share u (n,) of the way from a to b: lerp and slerp."""
-    turn = Rotation.from_matrix(np.swapaxes(a[:, :3, :3], 1, 2) @ b[:, :3, :3]).as_rotvec()
-    rotation = a[:, :3, :3] @ Rotation.from_rotvec(u[:, None] * turn).as_matrix()
-    return se3.from_rt(rotation, (1.0 - u)[:, None] * a[:, :3, 3] + u[:, None] * b[:, :3, 3])
+def causal_trajectory(odometry: Trajectory, keyframe_stamps_ns: I64, T_map_lidar: F64) -> Trajectory:
+    """Each sweep from the newest keyframe at its time and the odometry since. It jumps where a keyframe was corrected.
+
+    Args:
+        odometry: `T_odom_lidar` of every sweep; every keyframe is one of them.
+        keyframe_stamps_ns: (k,) strictly increasing.
+        T_map_lidar: (k, 4, 4) each as estimated at its time.
+
+    Returns:
+        `T_map_lidar` of every sweep; sweeps before the first keyframe take its correction.
+
+    Raises:
+        ValueError: no keyframes, or a keyframe that is no sweep.
+    """
+    row = _rows(odometry, keyframe_stamps_ns, T_map_lidar)
+    correction = T_map_lidar @ se3.inverse(odometry.poses[row])
+    newest = np.clip(np.searchsorted(row, np.arange(len(odometry)), side="right") - 1, 0, len(row) - 1)
+    return Trajectory(odometry.stamps_ns, correction[newest] @ odometry.poses, parent="map", child=odometry.child)
+
+
+def _rows(odometry: Trajectory, keyframe_stamps_ns: I64, T_map_lidar: F64) -> I64:
+    if not len(keyframe_stamps_ns) or len(keyframe_stamps_ns) != len(T_map_lidar):
+        raise ValueError(f"{len(keyframe_stamps_ns)} keyframes, {len(T_map_lidar)} poses")
+    row = np.searchsorted(odometry.stamps_ns, keyframe_stamps_ns)
+    found = np.minimum(row, len(odometry) - 1)
+    if not (odometry.stamps_ns[found] == keyframe_stamps_ns).all() or (np.diff(keyframe_stamps_ns) <= 0).any():
+        raise ValueError("every keyframe must be a sweep, in rising order")
+    return row

@@ -1,0 +1,43 @@
+"""What only the graph needs to know: a seen point whose place in the map is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mineloc.data import F64, Fix
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointFix:
+    """A point seen from a keyframe and known in the map: paper A's intersection factor, A(22).
+
+    Attributes:
+        keyframe: index.
+        point_map: (3,) where it is.
+        point_lidar: (3,) where it was seen, `t_l`.
+        covariance: (3, 3) of the difference in the map frame, metres² (METHOD D4, D7: what is uncertain about the
+            sighting is in here).
+    """
+
+    keyframe: int
+    point_map: F64
+    point_lidar: F64
+    covariance: F64
+
+    def __post_init__(self) -> None:
+        if self.point_map.shape != (3,) or self.point_lidar.shape != (3,) or self.covariance.shape != (3, 3):
+            raise ValueError("point_map and point_lidar must be (3,), covariance (3, 3)")
+
+    @staticmethod
+    def of(fix: Fix) -> PointFix:
+        """Only the position of a fix: the lidar itself is the point (METHOD D8).
+
+        Raises:
+            ValueError: the fix has no pose or no covariance.
+        """
+        if fix.T_map_lidar is None or fix.covariance is None:
+            raise ValueError("a fix without pose or covariance")
+        r = fix.T_map_lidar[:3, :3]
+        return PointFix(fix.keyframe, fix.T_map_lidar[:3, 3], np.zeros(3), r @ fix.covariance[3:, 3:] @ r.T)
