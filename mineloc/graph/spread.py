@@ -8,7 +8,7 @@ from mineloc import se3
 from mineloc.data import F64, I64, Trajectory
 
 
-def smoothed_trajectory(odometry: Trajectory, keyframe_stamps_ns: I64, T_map_lidar: F64) -> Trajectory:
+def spread(odometry: Trajectory, keyframe_stamps_ns: I64, keyframe_poses: F64) -> Trajectory:
     """Lay the odometry between the keyframes, without jumps.
 
     Between two keyframes the motion that odometry saw is carried on from the earlier and back from the later one; the
@@ -18,7 +18,7 @@ def smoothed_trajectory(odometry: Trajectory, keyframe_stamps_ns: I64, T_map_lid
     Args:
         odometry: `T_odom_lidar` of every sweep; every keyframe is one of them.
         keyframe_stamps_ns: (k,) strictly increasing.
-        T_map_lidar: (k, 4, 4) corrected poses.
+        keyframe_poses: (k, 4, 4) corrected `T_map_lidar`.
 
     Returns:
         `T_map_lidar` of every sweep.
@@ -26,8 +26,8 @@ def smoothed_trajectory(odometry: Trajectory, keyframe_stamps_ns: I64, T_map_lid
     Raises:
         ValueError: no keyframes, or a keyframe that is no sweep.
     """
-    row = _rows(odometry, keyframe_stamps_ns, T_map_lidar)
-    correction = T_map_lidar @ se3.inverse(odometry.poses[row])
+    row = _rows(odometry, keyframe_stamps_ns, keyframe_poses)
+    correction = keyframe_poses @ se3.inverse(odometry.poses[row])
     sweep = np.arange(len(odometry))
     before = np.clip(np.searchsorted(row, sweep, side="right") - 1, 0, len(row) - 1)
     after = np.minimum(before + 1, len(row) - 1)
@@ -39,29 +39,9 @@ def smoothed_trajectory(odometry: Trajectory, keyframe_stamps_ns: I64, T_map_lid
     return Trajectory(t, poses, parent="map", child=odometry.child)
 
 
-def causal_trajectory(odometry: Trajectory, keyframe_stamps_ns: I64, T_map_lidar: F64) -> Trajectory:
-    """Each sweep from the newest keyframe at its time and the odometry since. It jumps where a keyframe was corrected.
-
-    Args:
-        odometry: `T_odom_lidar` of every sweep; every keyframe is one of them.
-        keyframe_stamps_ns: (k,) strictly increasing.
-        T_map_lidar: (k, 4, 4) each as estimated at its time.
-
-    Returns:
-        `T_map_lidar` of every sweep; sweeps before the first keyframe take its correction.
-
-    Raises:
-        ValueError: no keyframes, or a keyframe that is no sweep.
-    """
-    row = _rows(odometry, keyframe_stamps_ns, T_map_lidar)
-    correction = T_map_lidar @ se3.inverse(odometry.poses[row])
-    newest = np.clip(np.searchsorted(row, np.arange(len(odometry)), side="right") - 1, 0, len(row) - 1)
-    return Trajectory(odometry.stamps_ns, correction[newest] @ odometry.poses, parent="map", child=odometry.child)
-
-
-def _rows(odometry: Trajectory, keyframe_stamps_ns: I64, T_map_lidar: F64) -> I64:
-    if not len(keyframe_stamps_ns) or len(keyframe_stamps_ns) != len(T_map_lidar):
-        raise ValueError(f"{len(keyframe_stamps_ns)} keyframes, {len(T_map_lidar)} poses")
+def _rows(odometry: Trajectory, keyframe_stamps_ns: I64, keyframe_poses: F64) -> I64:
+    if not len(keyframe_stamps_ns) or len(keyframe_stamps_ns) != len(keyframe_poses):
+        raise ValueError(f"{len(keyframe_stamps_ns)} keyframes, {len(keyframe_poses)} poses")
     row = np.searchsorted(odometry.stamps_ns, keyframe_stamps_ns)
     found = np.minimum(row, len(odometry) - 1)
     if not (odometry.stamps_ns[found] == keyframe_stamps_ns).all() or (np.diff(keyframe_stamps_ns) <= 0).any():

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from mineloc import se3
 from mineloc.data import Trajectory
-from mineloc.graph.spread import causal_trajectory, smoothed_trajectory
+from mineloc.graph.spread import spread
 
 START_NS = 1_790_000_000_000_000_000
 
@@ -33,7 +33,7 @@ def test_keyframes_are_met_and_between_them_nothing_jumps(seed, count):
     odometry = _odometry(60, seed)
     rows = np.sort(np.random.default_rng(seed).choice(60, count, replace=False))
     keyframes = _corrected(odometry, rows, seed)
-    smoothed = smoothed_trajectory(odometry, odometry.stamps_ns[rows], keyframes)
+    smoothed = spread(odometry, odometry.stamps_ns[rows], keyframes)
     np.testing.assert_allclose(smoothed.poses[rows], keyframes, atol=1e-9)
     assert (smoothed.parent, smoothed.child) == ("map", "lidar")
     # a step differs from odometry's by its share of the correction between its keyframes
@@ -52,41 +52,23 @@ def test_keyframes_are_met_and_between_them_nothing_jumps(seed, count):
 def test_without_correction_it_is_the_odometry():
     odometry = _odometry(40, 1)
     rows = np.array([0, 7, 20, 33])
-    for spread in (smoothed_trajectory, causal_trajectory):
-        same = spread(odometry, odometry.stamps_ns[rows], odometry.poses[rows])
-        np.testing.assert_allclose(same.poses, odometry.poses, atol=1e-12)
+    same = spread(odometry, odometry.stamps_ns[rows], odometry.poses[rows])
+    np.testing.assert_allclose(same.poses, odometry.poses, atol=1e-12)
 
 
 def test_a_constant_shift_moves_everything():
     odometry = _odometry(40, 2)
     rows = np.array([3, 17, 30])
     shift = se3.exp([0.1, 0.2, 0.3, 4, 5, 6])
-    for spread in (smoothed_trajectory, causal_trajectory):
-        moved = spread(odometry, odometry.stamps_ns[rows], shift @ odometry.poses[rows])
-        np.testing.assert_allclose(moved.poses, shift @ odometry.poses, atol=1e-9)
-
-
-def test_the_causal_one_knows_only_the_past():
-    odometry = _odometry(40, 3)
-    rows = np.array([0, 10, 20, 30])
-    keyframes = _corrected(odometry, rows, 3)
-    causal = causal_trajectory(odometry, odometry.stamps_ns[rows], keyframes)
-    np.testing.assert_allclose(causal.poses[rows], keyframes, atol=1e-9)
-    later = keyframes.copy()
-    later[2:] = _corrected(odometry, rows[2:], 99, 5.0)
-    other = causal_trajectory(odometry, odometry.stamps_ns[rows], later)
-    np.testing.assert_array_equal(causal.poses[:20], other.poses[:20])
-    # between keyframes it moves as odometry does
-    ours = se3.inverse(causal.poses[11:19]) @ causal.poses[12:20]
-    theirs = se3.inverse(odometry.poses[11:19]) @ odometry.poses[12:20]
-    np.testing.assert_allclose(ours, theirs, atol=1e-9)
+    moved = spread(odometry, odometry.stamps_ns[rows], shift @ odometry.poses[rows])
+    np.testing.assert_allclose(moved.poses, shift @ odometry.poses, atol=1e-9)
 
 
 def test_keyframes_must_be_sweeps():
     odometry = _odometry(10, 4)
     with pytest.raises(ValueError, match="must be a sweep"):
-        smoothed_trajectory(odometry, odometry.stamps_ns[[2]] + 1, odometry.poses[[2]])
+        spread(odometry, odometry.stamps_ns[[2]] + 1, odometry.poses[[2]])
     with pytest.raises(ValueError, match="must be a sweep"):
-        causal_trajectory(odometry, odometry.stamps_ns[[4, 2]], odometry.poses[[4, 2]])
+        spread(odometry, odometry.stamps_ns[[4, 2]], odometry.poses[[4, 2]])
     with pytest.raises(ValueError, match="0 keyframes"):
-        smoothed_trajectory(odometry, odometry.stamps_ns[:0], odometry.poses[:0])
+        spread(odometry, odometry.stamps_ns[:0], odometry.poses[:0])
