@@ -104,6 +104,7 @@ def localize(
     flight: Annotated[Path, typer.Argument(help="A canonical flight (of ingest or simulate).")],
     method: Annotated[str, typer.Option("--method", help="odometry or loam.")],
     out: Annotated[Path, typer.Option("--out", help="The run folder to write.")],
+    recording: Annotated[bool, typer.Option(help="Also write run.rrd, what `mineloc view` shows.")] = True,
     as_json: JsonOption = False,
     config: ConfigOption = None,
     overrides: SetOption = None,
@@ -116,6 +117,11 @@ def localize(
     settings = load_config(config, overrides or ())
     with progress_bar("localize") as progress:
         result = run_stage(flight, out, method=method, config=settings, progress=progress)
+    if recording:
+        from mineloc.view.run import record_run
+
+        with progress_bar("recording") as progress:
+            record_run(out, out / "run.rrd", flight=flight, config=settings, progress=progress)
     if as_json:
         sys.stdout.write(json.dumps(result.to_dict(), indent=1) + "\n")
         return
