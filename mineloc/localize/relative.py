@@ -13,7 +13,7 @@ from mineloc.errors import FlightError
 from mineloc.graph.batch import solve
 from mineloc.graph.causal import CausalEstimate
 from mineloc.graph.pose_graph import PoseGraph
-from mineloc.graph.spread import smoothed_trajectory
+from mineloc.graph.spread import spread
 from mineloc.localize.localization import Clock, FlightData, Localization, levelled_origin
 from mineloc.odometry.front_end import FrontEnd
 from mineloc.progress import Progress
@@ -87,7 +87,7 @@ class RelativeMethod:
             solution = solve(self._graph)
         stamps = np.array([step.stamp_ns for step in self._steps])
         odometry = Trajectory(stamps, np.stack([s.T_odom_lidar for s in self._steps]), parent="odom", child="lidar")
-        smoothed = smoothed_trajectory(odometry, np.array([k.stamp_ns for k in self._keyframes]), solution.poses)
+        smoothed = spread(odometry, np.array([k.stamp_ns for k in self._keyframes]), solution.poses)
         return Localization(
             smoothed=smoothed,
             online=Trajectory(stamps, np.stack(self._online), child="lidar"),
