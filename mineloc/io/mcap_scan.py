@@ -35,6 +35,7 @@ _CHUNK_HEAD_BYTES = 48
 _RUN_BYTES = 1 << 20
 _WINDOW_BYTES = 8 << 20
 _BARE = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
+_FIXED_LENGTHS: dict[int, int] = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 _NS = 1e-9
 
 
@@ -115,6 +116,7 @@ class _Scan:
                 raise RecordError("bytes that are no record")
             if length > self.size - content:
                 raise RecordError(f"the file ends within a {_name(opcode)}")
+            self._check_length(opcode, content, length)
         except RecordError as error:
             return self._resume(position, str(error))
         end = content + length
@@ -128,14 +130,25 @@ class _Scan:
             self._other(opcode, position, content, length)
         return end
 
+    def _check_length(self, opcode: int, content: int, length: int) -> None:
+        """Records that say their length twice must say it alike: a damaged length would skip what follows."""
+        head = read_exactly(self.file, content, min(_CHUNK_HEAD_BYTES, length))
+        if opcode == Opcode.CHUNK:
+            parse_chunk_header(head, length)
+        elif opcode == Opcode.MESSAGE_INDEX:
+            if length < 6 or int.from_bytes(head[2:6], "little") != length - 6:
+                raise RecordError("a damaged message index")
+        elif length != _FIXED_LENGTHS.get(opcode, length):
+            raise RecordError(f"a damaged {_name(opcode)}")
+
     def _chunk(self, position: int, length: int) -> None:
         self.orphan_counts = None
         head: ChunkHeader | None = None
         try:
             content = read_exactly(self.file, position + RECORD_HEADER.size, length)
-            header = head = parse_chunk_header(content, length)
-            plain = unpack_chunk(header, memoryview(content)[header.data_start :])
-            self._count(position, length + RECORD_HEADER.size, plain, header)
+            head = parse_chunk_header(content, length)
+            plain = unpack_chunk(head, memoryview(content)[head.data_start :])
+            self._count(position, length + RECORD_HEADER.size, plain, head)
         except RecordError as error:
             self.orphan_counts = {}
             self._note(position, f"unreadable chunk ({error})", head=head)
