@@ -9,6 +9,7 @@ from typing import Any
 from mineloc.config import Config
 from mineloc.output import new_file
 from mineloc.stages.evaluate import SCHEMA, evaluate
+from mineloc.stages.run_folder import RunFolder
 
 
 def score(run: Path, *, reference: Path | None = None, out: Path, config: Config) -> None:
@@ -21,7 +22,7 @@ def score(run: Path, *, reference: Path | None = None, out: Path, config: Config
         EvaluationError, FormatError: as `stages.evaluate`.
         OutputError: `out` cannot be written.
     """
-    if reference is None and not (run / "reference.tum").exists():
+    if reference is None and RunFolder.open(run).reference is None:
         found: dict[str, Any] = {
             "schema": SCHEMA,
             "estimate": run.name,
