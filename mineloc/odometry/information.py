@@ -23,6 +23,7 @@ class EdgeNoise:
             as n / correlation.
         floor_rad, floor_m: added to every edge: errors that do not average out however many points there are.
         weak_m: added along weak directions: what looks like information there is mostly noise of the normals.
+        prior_rad, prior_m: what is known of an edge without any registration.
         coast_radps, coast_mps: added for every second that rests on the motion prior alone.
     """
 
@@ -30,7 +31,9 @@ class EdgeNoise:
     correlation: float = 20.0
     floor_rad: float = 0.0005
     floor_m: float = 0.005
-    weak_m: float = 0.3
+    weak_m: float = 1.0
+    prior_rad: float = 0.3
+    prior_m: float = 1.0
     coast_radps: float = 0.2
     coast_mps: float = 1.0
 
@@ -58,8 +61,9 @@ def edge_information(
 ) -> F64:
     """Information matrix of the relative pose to a keyframe, from the registration of that keyframe.
 
-    I = (H')⁻¹ inflated: H' = H / (2σ² · correlation), Σ = H'⁻¹ + F, with the floor, the weak directions and coasting
-    in F. One matrix an edge, never accumulated (METHOD D2). Computed as (1 + H' F)⁻¹ H', which holds for singular H.
+    I = (H'⁻¹ + F)⁻¹ + P with H' = H / (2σ² · correlation); F holds the floor, the weak directions and coasting, P the
+    prior, without which a graph could not be solved where nothing was seen. One matrix an edge, never accumulated
+    (METHOD D2). The first term is computed as (1 + H' F)⁻¹ H', which holds for singular H.
 
     Args:
         hessian: (6, 6) as for `degeneracy_of`.
@@ -68,7 +72,7 @@ def edge_information(
         coasted_s: seconds between the keyframes that no registration supports.
 
     Returns:
-        (6, 6) symmetric, positive semi-definite, `[rotation, translation]`, right perturbation of the later keyframe.
+        (6, 6) symmetric, positive definite, `[rotation, translation]`, right perturbation of the later keyframe.
     """
     noise = noise or EdgeNoise()
     h = hessian / (2.0 * noise.sigma_m**2 * noise.correlation)
@@ -78,7 +82,8 @@ def edge_information(
     weak = degeneracy.weak_directions
     inflation[3:, 3:] += noise.weak_m**2 * weak.T @ weak
     information = np.linalg.solve(np.eye(6) + h @ inflation, h)
-    return 0.5 * (information + information.T)
+    prior = np.diag([1.0 / noise.prior_rad**2] * 3 + [1.0 / noise.prior_m**2] * 3)
+    return 0.5 * (information + information.T) + prior
 
 
 def _translation_block(hessian: F64) -> F64:

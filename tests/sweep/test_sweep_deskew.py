@@ -41,7 +41,7 @@ def test_no_motion_changes_no_point(seed: int, target_ms: int) -> None:
     assert np.array_equal(still.ring, sweep.ring)  # type: ignore[arg-type]
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=40)
 @given(seed=st.integers(0, 1000), twist=TWISTS, target_ms=st.integers(-50, 150))
 def test_the_kernel_agrees_with_one_exponential_a_point(seed: int, twist: F64, target_ms: int) -> None:
     sweep = random_sweep(seed)
@@ -51,7 +51,7 @@ def test_the_kernel_agrees_with_one_exponential_a_point(seed: int, twist: F64, t
     assert np.abs(fast.points_lidar - exact.points_lidar).max() < 3e-5
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=40)
 @given(seed=st.integers(0, 1000), twist=TWISTS)
 def test_a_static_point_seen_at_different_times_is_one_point_again(seed: int, twist: F64) -> None:
     target_ns = 60_000_000
@@ -63,7 +63,7 @@ def test_a_static_point_seen_at_different_times_is_one_point_again(seed: int, tw
     assert np.abs(deskew_constant_twist(sweep, twist, target_ns=target_ns).points_lidar - anchor).max() < 3e-5
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=40)
 @given(seed=st.integers(0, 1000), twist=TWISTS)
 def test_an_instant_sweep_moves_rigidly(seed: int, twist: F64) -> None:
     points = random_sweep(seed).points_lidar
@@ -71,7 +71,7 @@ def test_an_instant_sweep_moves_rigidly(seed: int, twist: F64) -> None:
     assert np.allclose(moved.points_lidar, se3.apply(se3.exp(-0.1 * twist), points), atol=1e-5)
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=40)
 @given(seed=st.integers(0, 1000))
 def test_poses_agree_with_one_interpolation_a_point(seed: int) -> None:
     sweep = random_sweep(seed)

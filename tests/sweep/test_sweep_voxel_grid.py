@@ -14,7 +14,7 @@ def cloud(seed: int, n: int) -> F32:
     return (rng.normal(0, 3, (n, 3)) * rng.choice([0.1, 1.0, 10.0])).astype(np.float32)
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=40)
 @given(seed=st.integers(0, 10_000), n=st.integers(0, 2000), voxel_m=st.floats(0.05, 5.0))
 def test_the_kernels_agree_with_plain_numpy(seed: int, n: int, voxel_m: float) -> None:
     points = cloud(seed, n)
@@ -23,7 +23,7 @@ def test_the_kernels_agree_with_plain_numpy(seed: int, n: int, voxel_m: float) -
     assert np.allclose(voxel_centroids(points, voxel_m), centroids, rtol=1e-6, atol=1e-6)
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=40)
 @given(seed=st.integers(0, 10_000), n=st.integers(1, 2000), voxel_m=st.floats(0.05, 5.0))
 def test_one_point_a_voxel_and_none_lost(seed: int, n: int, voxel_m: float) -> None:
     points = cloud(seed, n)
