@@ -2,29 +2,17 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
+from numpy.typing import NDArray
 
 from mineloc import se3
-from mineloc.compiled import njit
 from mineloc.data import F64, I64, ImuSamples
 from mineloc.odometry.motion import BodyPath, add_to_pose, exp_so3, pose_deviation
+from mineloc.odometry.strapdown import GRAVITY_MPS2, ImuNoise, integrate
 
-GRAVITY_MPS2 = 9.80665
 GAP_S = 0.05
 """A longer pause between samples is a hole: what happens in it is guessed, not measured."""
-_GAP_RADPS2, _GAP_MPS2 = 2.0, 3.0
 _START_SIGMAS = np.repeat([0.02, 1e-4, 1.0, 0.003, 0.05], 3)
-
-
-class ImuNoise(NamedTuple):
-    """Densities: gyro rad/s/√Hz, accelerometer m/s²/√Hz (vibration included), and the walks of their biases."""
-
-    gyro: float
-    accel: float
-    gyro_walk: float
-    accel_walk: float
 
 
 class ImuMotion:
@@ -74,24 +62,18 @@ class ImuMotion:
             stamps = np.array([min(start_ns, end_ns) - 1, end_ns], dtype=np.int64)
             return BodyPath(stamps, np.stack([self.T_odom_body] * 2))
         stamps, gyro, accel = self._nodes(end_ns)
-        rotations, positions, self.velocity_mps, self.covariance = _integrate(
-            (stamps - self.stamp_ns) * 1e-9,
-            gyro - self.gyro_bias_radps,
-            accel - self.accel_bias_mps2,
-            np.ascontiguousarray(self.T_odom_body[:3, :3]),
-            self.T_odom_body[:3, 3].copy(),
-            self.velocity_mps,
-            self.covariance,
-            self._noise,
-        )
-        poses = se3.from_rt(rotations, positions)
+        rates, forces = gyro - self.gyro_bias_radps, accel - self.accel_bias_mps2
+        times_s, guessed = np.asarray((stamps - self.stamp_ns) * 1e-9, np.float64), self._guessed(stamps)
+        start = self.T_odom_body, self.velocity_mps, self.covariance
+        moved = integrate(times_s, rates, forces, guessed, *start, self._noise)
+        poses = moved.poses
         if start_ns < self.stamp_ns:
             # the sweep began a little before the last one ended
             back = -1e-9 * (self.stamp_ns - start_ns)
-            turn = exp_so3(back * (gyro[0] - self.gyro_bias_radps))
-            first = se3.from_rt(poses[0, :3, :3] @ turn, poses[0, :3, 3] + back * self.velocity_mps)
+            first = se3.from_rt(poses[0, :3, :3] @ exp_so3(back * rates[0]), poses[0, :3, 3] + back * self.velocity_mps)
             stamps = np.concatenate([np.array([start_ns]), stamps])
             poses = np.concatenate([first[None], poses])
+        self.velocity_mps, self.covariance = moved.velocity_mps, moved.covariance
         self.T_odom_body, self.stamp_ns = poses[-1], end_ns
         self._predicted = self._state()
         return BodyPath(stamps, poses)
@@ -126,52 +108,14 @@ class ImuMotion:
         accel = np.stack([np.interp(x, at, column) for column in s.accel_mps2.T], axis=1)
         return stamps, gyro, accel
 
-
-@njit(cache=True, nogil=True)
-def _integrate(
-    times_s: F64, gyro: F64, accel: F64, R: F64, p: F64, v: F64, P: F64, noise: ImuNoise
-) -> tuple[F64, F64, F64, F64]:
-    """Trapezoid in the rates, midpoint in the attitude; the covariance by first-order transition a step."""
-    m = len(times_s)
-    Rs, ps = np.empty((m, 3, 3)), np.empty((m, 3))
-    Rs[0], ps[0] = R, p
-    v, P = v.copy(), P.copy()
-    for k in range(m - 1):
-        dt = times_s[k + 1] - times_s[k]
-        w = 0.5 * (gyro[k] + gyro[k + 1])
-        f = 0.5 * (accel[k] + accel[k + 1])
-        dR = exp_so3(w * dt)
-        a = Rs[k] @ (exp_so3(0.5 * dt * w) @ f)
-        a[2] -= GRAVITY_MPS2
-        ps[k + 1] = ps[k] + v * dt + 0.5 * a * dt * dt
-        v = v + a * dt
-        Rs[k + 1] = Rs[k] @ dR
-        F = _transition(Rs[k], dR, f, dt)
-        P = F @ P @ F.T
-        gap = dt > GAP_S
-        gyro2 = noise.gyro**2 + (_GAP_RADPS2**2 * dt * dt if gap else 0.0)
-        accel2 = noise.accel**2 + (_GAP_MPS2**2 if gap else 0.0)
-        for i in range(3):
-            P[i, i] += gyro2 * dt
-            P[3 + i, 3 + i] += accel2 * dt**3 / 3.0
-            P[6 + i, 6 + i] += accel2 * dt
-            P[9 + i, 9 + i] += noise.gyro_walk**2 * dt
-            P[12 + i, 12 + i] += noise.accel_walk**2 * dt
-    return Rs, ps, v, P
-
-
-@njit(cache=True, nogil=True)
-def _transition(R: F64, dR: F64, f: F64, dt: float) -> F64:
-    """(15, 15) error transition of one step."""
-    F = np.eye(15)
-    f_hat = np.array([[0.0, -f[2], f[1]], [f[2], 0.0, -f[0]], [-f[1], f[0], 0.0]])
-    Rf = R @ f_hat
-    F[0:3, 0:3] = dR.T
-    F[6:9, 0:3] = -Rf * dt
-    F[6:9, 12:15] = -R * dt
-    F[3:6, 0:3] = -0.5 * Rf * dt * dt
-    F[3:6, 12:15] = -0.5 * R * dt * dt
-    for i in range(3):
-        F[i, 9 + i] = -dt
-        F[3 + i, 6 + i] = dt
-    return F
+    def _guessed(self, stamps_ns: I64) -> NDArray[np.bool_]:
+        """(m - 1,) which steps between the nodes lie in a hole of the samples, however short the steps are."""
+        known = self._samples.stamps_ns
+        if not len(known):
+            return np.ones(len(stamps_ns) - 1, np.bool_)
+        start, end = stamps_ns[:-1], stamps_ns[1:]
+        before = np.searchsorted(known, start, side="right") - 1
+        after = np.searchsorted(known, end, side="left")
+        since = np.where(before >= 0, known[np.maximum(before, 0)], start)
+        until = np.where(after < len(known), known[np.minimum(after, len(known) - 1)], end)
+        return (until - since) * 1e-9 > GAP_S

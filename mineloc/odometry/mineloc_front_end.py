@@ -15,11 +15,12 @@ from mineloc.config import KeyframeConfig, OdometryConfig
 from mineloc.data import F32, F64, Calibration, Degeneracy, ImuSamples, Keyframe, OdometryStep, RelativePose, Sweep
 from mineloc.errors import FlightError
 from mineloc.odometry.constant_velocity import ConstantVelocity
-from mineloc.odometry.imu_motion import GRAVITY_MPS2, ImuMotion, ImuNoise
+from mineloc.odometry.imu_motion import ImuMotion
 from mineloc.odometry.information import EdgeNoise, degeneracy_of, edge_information
 from mineloc.odometry.keyframes import KeyframeSelector
 from mineloc.odometry.motion import BodyPath, MotionModel
 from mineloc.odometry.registration import Linearised, Weighting, linearise
+from mineloc.odometry.strapdown import GRAVITY_MPS2, ImuNoise
 from mineloc.odometry.voxel_map import VoxelMap
 from mineloc.sweep.deskew import transform_between_knots
 from mineloc.sweep.voxel_grid import mean_by_label, number_voxels, voxel_centroids

@@ -9,12 +9,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mineloc import se3
 from mineloc.compiled import njit, prange
 from mineloc.config import OdometryConfig
-from mineloc.data import F64
-from mineloc.odometry.voxel_map import COUNT, LAMBDA, MAJOR, MEAN, NORMAL, PatchArrays, VoxelMap, find
+from mineloc.data import F32, F64, Bool
+from mineloc.odometry.patches import COUNT, LAMBDA, MAJOR, MEAN, NORMAL, PatchArrays, find
+from mineloc.odometry.voxel_map import VoxelMap, fits_at_plainly
 
 CHUNKS = 8
 """Partial sums, fixed so that the result does not depend on the number of threads."""
@@ -79,38 +80,43 @@ def linearise(
     """
     fine, coarse = maps
     R, t = np.ascontiguousarray(T_odom_body[:3, :3]), T_odom_body[:3, 3].copy()
-    H, b, tally = _linearise(points_body, weights, R, t, fine.arrays, fine.voxel_m, coarse.arrays, coarse.voxel_m, w)
+    Hs, bs, tallies = np.zeros((CHUNKS, 6, 6)), np.zeros((CHUNKS, 6)), np.zeros((CHUNKS, _TALLIES))
+    _linearise(points_body, weights, R, t, fine.arrays, fine.voxel_m, coarse.arrays, coarse.voxel_m, w, Hs, bs, tallies)
+    upper, b, tally = Hs.sum(axis=0), bs.sum(axis=0), tallies.sum(axis=0)
+    H = upper + np.triu(upper, 1).T
     planar = int(tally[_PLANAR])
     rms = float(np.sqrt(tally[_SQUARES] / planar)) if planar else float("nan")
     return Linearised(H, b, planar, int(tally[_OTHER]), int(tally[_REJECTED]), rms)
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _patch_at(arrays: PatchArrays, voxel_m: float, x: float, y: float, z: float) -> int:
+@njit(cache=True, nogil=True)
+def _patch_at(arrays: PatchArrays, inverse_m: float, x: float, y: float, z: float) -> int:
     """Row of the fitted patch at a place, -1 if there is none."""
-    row = find(
-        arrays.keys, arrays.rows, int(np.floor(x / voxel_m)), int(np.floor(y / voxel_m)), int(np.floor(z / voxel_m))
-    )
+    ix, iy, iz = int(np.floor(x * inverse_m)), int(np.floor(y * inverse_m)), int(np.floor(z * inverse_m))
+    row = find(arrays.keys, arrays.rows, ix, iy, iz)
     if row >= 0 and arrays.fits[row, COUNT] > 0:
         return row
     return -1
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _is_plane(fit: NDArray[np.float32], min_width_m: float, max_flatness: float) -> bool:
+@njit(cache=True, nogil=True)
+def _is_plane(fit: F32, min_width_m: float, max_flatness: float) -> bool:
     """Flat and wide in both directions.
 
     Width is the point: the returns of one ring lie in a line, and range noise spreads them *along the beam*, so that
     the plane fitted to them is the ring's own scanning cone. Such patches tilt a pose by degrees at every junction.
     """
-    total = fit[LAMBDA] + fit[LAMBDA + 1] + fit[LAMBDA + 2]
-    return fit[LAMBDA + 1] > min_width_m * min_width_m and fit[LAMBDA] < max_flatness * total
+    return fit[LAMBDA + 1] > min_width_m * min_width_m and fit[LAMBDA] < max_flatness * _spread(fit)
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _plane_variance(
-    fit: NDArray[np.float32], e: F64, r: float, cos2: float, d2: float, ranges: float, w: Weighting
-) -> float:
+@njit(cache=True, nogil=True)
+def _spread(fit: F32) -> float:
+    """Sum of the eigenvalues (m²), not in single precision."""
+    return np.float64(fit[LAMBDA]) + fit[LAMBDA + 1] + fit[LAMBDA + 2]
+
+
+@njit(cache=True, nogil=True)
+def _plane_variance(fit: F32, e: F64, r: float, cos2: float, d2: float, ranges: float, w: Weighting) -> float:
     along = fit[MAJOR] * e[0] + fit[MAJOR + 1] * e[1] + fit[MAJOR + 2] * e[2]
     across2 = max(e[0] * e[0] + e[1] * e[1] + e[2] * e[2] - r * r - along * along, 0.0)
     noise = w.range_sigma_m**2 * cos2 + d2 * w.angle_sigma_rad**2 * (1.0 - cos2)
@@ -119,7 +125,7 @@ def _plane_variance(
     return noise / ranges + fit[LAMBDA] + plane + w.surface_sigma_m**2
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def _add_row(H: F64, b: F64, J: F64, p: F64, R: F64, n: F64, residual: float, weight: float) -> None:
     """One residual along the direction n: J = [p × Rᵀn, n]; the upper triangle of H."""
     qx = R[0, 0] * n[0] + R[1, 0] * n[1] + R[2, 0] * n[2]
@@ -134,7 +140,7 @@ def _add_row(H: F64, b: F64, J: F64, p: F64, R: F64, n: F64, residual: float, we
             H[j, k] += wj * J[k]
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def _robust(u: float, kernel: float) -> float:
     """Geman-McClure weight of a squared normalised residual."""
     k2 = kernel * kernel
@@ -155,10 +161,10 @@ def _accumulate(
             q[a] = R[a, 0] * p[0] + R[a, 1] * p[1] + R[a, 2] * p[2]
         x, y, z = q[0] + t[0], q[1] + t[1], q[2] + t[2]
         patches = fine
-        row = _patch_at(fine, fine_m, x, y, z)
+        row = _patch_at(fine, 1.0 / fine_m, x, y, z)
         flat = row >= 0 and _is_plane(fine.fits[row], w.min_width_m, w.max_flatness)
         if not flat:
-            wider = _patch_at(coarse, coarse_m, x, y, z)
+            wider = _patch_at(coarse, 1.0 / coarse_m, x, y, z)
             if wider >= 0 and _is_plane(coarse.fits[wider], 2.0 * w.min_width_m, w.max_flatness):
                 patches, row, flat = coarse, wider, True
         if row < 0:
@@ -181,7 +187,7 @@ def _accumulate(
             tally[_PLANAR] += 1
             tally[_SQUARES] += r * r
         elif w.point_weight > 0:
-            variance = (fit[LAMBDA] + fit[LAMBDA + 1] + fit[LAMBDA + 2]) / 3.0 + w.range_sigma_m**2
+            variance = _spread(fit) / 3.0 + w.range_sigma_m**2
             u = (e[0] * e[0] + e[1] * e[1] + e[2] * e[2]) / variance
             if u > w.gate * w.gate:
                 tally[_REJECTED] += 1
@@ -198,8 +204,8 @@ def _accumulate(
 def _linearise(
     points: F64, ranges: F64, R: F64, t: F64,
     fine: PatchArrays, fine_m: float, coarse: PatchArrays, coarse_m: float, w: Weighting,
-) -> tuple[F64, F64, F64]:  # fmt: skip
-    Hs, bs, tallies = np.zeros((CHUNKS, 6, 6)), np.zeros((CHUNKS, 6)), np.zeros((CHUNKS, _TALLIES))
+    Hs: F64, bs: F64, tallies: F64,
+) -> None:  # fmt: skip
     n = len(points)
     size = (n + CHUNKS - 1) // CHUNKS
     for c in prange(CHUNKS):
@@ -207,12 +213,59 @@ def _linearise(
             points, ranges, c * size, min(n, (c + 1) * size), R, t, fine, fine_m, coarse, coarse_m, w,
             Hs[c], bs[c], tallies[c],
         )  # fmt: skip
-    H, b, tally = np.zeros((6, 6)), np.zeros(6), np.zeros(_TALLIES)
-    for c in range(CHUNKS):
-        H += Hs[c]
-        b += bs[c]
-        tally += tallies[c]
-    for j in range(6):
-        for k in range(j):
-            H[j, k] = H[k, j]
-    return H, b, tally
+
+
+def linearise_plainly(
+    points_body: F64, weights: F64, T_odom_body: F64, maps: tuple[VoxelMap, VoxelMap], w: Weighting
+) -> Linearised:
+    """`linearise` in plain numpy: what the kernel is held to."""
+    R, t = T_odom_body[:3, :3], T_odom_body[:3, 3]
+    places = points_body @ R.T + t
+    fit, flat = _chosen_plainly(places, maps, w)
+    e = places - fit[:, MEAN : MEAN + 3]
+    # of the place against a right rotation and a translation in odom: [-R [p]x, 1]
+    J = np.concatenate([-R @ se3.hat(points_body), np.tile(np.eye(3), (len(e), 1, 1))], axis=2)
+    r = np.einsum("ni,ni->n", fit[:, NORMAL : NORMAL + 3], e)
+    variance, square = np.empty(len(e)), np.where(flat, r * r, np.einsum("ni,ni->n", e, e))
+    variance[flat] = _plane_variances_plainly(fit[flat], e[flat], points_body[flat] @ R.T, weights[flat], w)
+    variance[~flat] = fit[~flat, LAMBDA : LAMBDA + 3].mean(axis=1) + w.range_sigma_m**2
+    u = square / variance
+    seen = (fit[:, COUNT] > 0) & (flat | (w.point_weight > 0))
+    inside = seen & ~(u > w.gate**2)
+    weight = inside * np.where(flat, 1.0, w.point_weight) / (1.0 + u / w.kernel**2) ** 2 / variance
+    # a plane counts along its normal, a point in every direction
+    n = fit[:, NORMAL : NORMAL + 3]
+    onto = np.where(flat[:, None, None], n[:, :, None] * n[:, None, :], np.eye(3))
+    H = np.einsum("n,naj,nab,nbk->jk", weight, J, onto, J, optimize=True)
+    b = np.einsum("n,naj,nab,nb->j", weight, J, onto, e, optimize=True)
+    planar = inside & flat
+    rms = float(np.sqrt(square[planar].mean())) if planar.any() else float("nan")
+    return Linearised(H, b, int(planar.sum()), int((inside & ~flat).sum()), int((seen & ~inside).sum()), rms)
+
+
+def _chosen_plainly(places: F64, maps: tuple[VoxelMap, VoxelMap], w: Weighting) -> tuple[F64, Bool]:
+    """(n, 13) the patch for each place, its mean in odom, count 0 where there is none; (n,) whether it is a plane."""
+    fine, coarse = (fits_at_plainly(patches, places) for patches in maps)
+
+    def planes(fit: F64, width_m: float) -> Bool:
+        low, mid = fit[:, LAMBDA], fit[:, LAMBDA + 1]
+        return (
+            (fit[:, COUNT] > 0) & (mid > width_m**2) & (low < w.max_flatness * fit[:, LAMBDA : LAMBDA + 3].sum(axis=1))
+        )
+
+    is_fine = planes(fine, w.min_width_m)
+    is_coarse = ~is_fine & planes(coarse, 2.0 * w.min_width_m)
+    return np.where(is_coarse[:, None], coarse, fine), is_fine | is_coarse
+
+
+def _plane_variances_plainly(fit: F64, e: F64, turned: F64, ranges: F64, w: Weighting) -> F64:
+    """(n,) variance of point-to-plane residuals; `turned` are the points as seen from the sensor, in odom's axes."""
+    n, major = fit[:, NORMAL : NORMAL + 3], fit[:, MAJOR : MAJOR + 3]
+    d2 = np.maximum(np.einsum("ni,ni->n", turned, turned), MIN_LAMBDA_M2)
+    cos2 = np.einsum("ni,ni->n", n, turned) ** 2 / d2
+    r, along = np.einsum("ni,ni->n", n, e), np.einsum("ni,ni->n", major, e)
+    across2 = np.maximum(np.einsum("ni,ni->n", e, e) - r**2 - along**2, 0.0)
+    low, mid, high = fit[:, LAMBDA : LAMBDA + 3].T
+    range_noise = (w.range_sigma_m**2 * cos2 + d2 * w.angle_sigma_rad**2 * (1.0 - cos2)) / ranges
+    leverage = 1.0 + along**2 / np.maximum(high, MIN_LAMBDA_M2) + across2 / np.maximum(mid, MIN_LAMBDA_M2)
+    return range_noise + low + (low + MIN_LAMBDA_M2) / fit[:, COUNT] * leverage + w.surface_sigma_m**2

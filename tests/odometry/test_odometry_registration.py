@@ -1,0 +1,192 @@
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mineloc import se3
+from mineloc.config import OdometryConfig
+from mineloc.data import F64
+from mineloc.odometry.motion import add_to_pose
+from mineloc.odometry.registration import Weighting, linearise, linearise_plainly
+from mineloc.odometry.voxel_map import VoxelMap
+
+DEFAULT = Weighting.of(OdometryConfig())
+
+
+@dataclass(frozen=True)
+class Place:
+    """A rough room as two maps, and what is seen from a pose in it."""
+
+    maps: tuple[VoxelMap, VoxelMap]
+    points_body: F64
+    ranges: F64
+    T: F64
+
+
+def place(seed: int, *, n: int = 2000, roughness_m: float = 0.02) -> Place:
+    rng = np.random.default_rng(seed)
+    T = se3.exp(np.concatenate([rng.normal(0, 0.3, 3), rng.normal(0, 0.5, 3)]))
+    maps = VoxelMap(0.3, min_weight=5.0, growth=0.0), VoxelMap(0.9, min_weight=5.0, growth=0.0)
+    for patches in maps:
+        patches.insert(on_walls(rng, 10 * n, roughness_m), now=0.0)
+    seen = se3.apply(se3.inverse(T), on_walls(rng, n, roughness_m))
+    return Place(maps, seen, rng.integers(1, 9, n).astype(float), T)
+
+
+def on_walls(rng: np.random.Generator, n: int, roughness_m: float) -> F64:
+    """Points on the inside of a box of 6 x 5 x 4 m, with a heap of rubble in a corner."""
+    half = np.array([3.0, 2.5, 2.0])
+    points = rng.uniform(-1, 1, (n, 3)) * half
+    wall, side = rng.integers(0, 3, n), rng.choice([-1.0, 1.0], n)
+    points[np.arange(n), wall] = side * half[wall] + rng.normal(0, roughness_m, n)
+    rubble = rng.uniform(size=n) < 0.1
+    points[rubble] = half * 0.7 + rng.normal(0, 0.3, (int(rubble.sum()), 3))
+    return points
+
+
+@settings(deadline=None, max_examples=15)
+@given(
+    seed=st.integers(0, 10_000),
+    off=st.floats(0, 0.2),
+    point_weight=st.sampled_from([0.0, 0.1, 1.0]),
+    gate=st.sampled_from([1.5, 8.0]),
+    width_m=st.sampled_from([0.0, 0.05, 0.12]),
+)
+def test_the_kernel_agrees_with_plain_numpy(
+    seed: int, off: float, point_weight: float, gate: float, width_m: float
+) -> None:
+    p = place(seed, n=500)
+    T = p.T @ se3.exp(np.random.default_rng(seed).normal(0, off, 6))
+    w = DEFAULT._replace(point_weight=point_weight, gate=gate, min_width_m=width_m)
+    fast, plain = (
+        linearise(p.points_body, p.ranges, T, p.maps, w),
+        linearise_plainly(p.points_body, p.ranges, T, p.maps, w),
+    )
+    assert fast[2:5] == plain[2:5]
+    assert np.allclose(fast.H, plain.H, rtol=1e-9, atol=1e-9 * np.abs(plain.H).max(initial=1e-9))
+    assert np.allclose(fast.b, plain.b, rtol=1e-9, atol=1e-9 * np.abs(plain.H).max(initial=1e-9))
+    assert fast.residual_m == pytest.approx(plain.residual_m, rel=1e-9, nan_ok=True)
+
+
+def test_every_kind_of_residual_takes_part() -> None:
+    # else the comparison above proves little
+    p = place(1)
+    T = p.T @ se3.exp([0.04, 0, 0, 0.2, 0, 0])
+    all_kinds = linearise(p.points_body, p.ranges, T, p.maps, DEFAULT)
+    assert all_kinds.planar > 500
+    assert all_kinds.other > 50
+    assert all_kinds.rejected >= 10
+    fine_only = linearise(p.points_body, p.ranges, T, (p.maps[0], VoxelMap(0.9)), DEFAULT)
+    assert fine_only.planar < all_kinds.planar
+
+
+def test_the_number_of_threads_changes_no_bit() -> None:
+    p = place(2)
+    threads, results = numba.get_num_threads(), []
+    try:
+        for n in range(1, numba.config.NUMBA_NUM_THREADS + 1):
+            numba.set_num_threads(n)
+            results.append(linearise(p.points_body, p.ranges, p.T, p.maps, DEFAULT))
+    finally:
+        numba.set_num_threads(threads)
+    for other in results[1:]:
+        assert np.array_equal(other.H, results[0].H)
+        assert np.array_equal(other.b, results[0].b)
+
+
+def test_the_gradient_and_the_hessian_are_the_numeric_ones() -> None:
+    # constant variance and no robust weights, so that H and b are those of plain least squares
+    p = flat_wall_place()
+    w = DEFAULT._replace(kernel=1e9, gate=1e9, angle_sigma_rad=0.0, surface_sigma_m=10.0, point_weight=0.0)
+    off = add_to_pose(p.T, np.array([0.03, -0.02, 0.01, 0.05, 0.04, -0.03]))
+    h = 1e-3
+    axes = h * np.eye(6)
+
+    def cost(T: F64, error: F64) -> float:
+        there = linearise(p.points_body, p.ranges, add_to_pose(T, error), p.maps, w)
+        assert there.planar == len(p.points_body)
+        return 0.5 * there.residual_m**2 * there.planar / w.surface_sigma_m**2
+
+    gradient = np.array([(cost(off, e) - cost(off, -e)) / (2 * h) for e in axes])
+    assert linearise(p.points_body, p.ranges, off, p.maps, w).b == pytest.approx(
+        gradient, rel=1e-3, abs=1e-3 * np.abs(gradient).max()
+    )
+    # at the truth the curvature of the residuals, which Gauss-Newton leaves out, does not count
+    hessian = np.array(
+        [[sum(s * q * cost(p.T, s * e + q * f) for s in (1, -1) for q in (1, -1)) for f in axes] for e in axes]
+    ) / (4 * h**2)
+    H = linearise(p.points_body, p.ranges, p.T, p.maps, w).H
+    assert np.allclose(H, hessian, rtol=1e-3, atol=1e-3 * np.abs(hessian).max())
+
+
+def flat_wall_place() -> Place:
+    """One patch a wall, seen well inside the patches, so that no small motion changes what is matched."""
+    rng = np.random.default_rng(5)
+    normals = np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [0.6, 0.8, 0], [0, 0.6, 0.8]])
+    fine, coarse = VoxelMap(3.0, growth=0.0), VoxelMap(9.0, growth=0.0)
+    points = []
+    for k, n in enumerate(normals):
+        across = np.linalg.svd(n[None])[2][1:]
+        centre = np.array([1.5, 1.5, 1.5]) + 3.0 * np.array([k - 2, k % 2, (k + 1) % 3])
+        fine.insert(centre + rng.uniform(-1.3, 1.3, (400, 2)) @ across, now=0.0)
+        points.append(centre + rng.uniform(-0.8, 0.8, (40, 2)) @ across)
+    T = se3.exp([0.2, -0.1, 0.4, 1.0, 0.5, -0.3])
+    return Place((fine, coarse), se3.apply(se3.inverse(T), np.concatenate(points)), np.ones(200), T)
+
+
+def test_at_the_truth_the_residual_and_the_step_are_nothing() -> None:
+    p = flat_wall_place()
+    out = linearise(p.points_body, p.ranges, p.T, p.maps, DEFAULT)
+    assert out.residual_m < 1e-6  # fits are single precision
+    assert np.abs(np.linalg.solve(out.H, out.b)).max() < 1e-6
+
+
+@settings(deadline=None, max_examples=8)
+@given(seed=st.integers(0, 10_000))
+def test_gauss_newton_comes_back_to_the_truth(seed: int) -> None:
+    p = place(seed, roughness_m=0.005)
+    rng = np.random.default_rng(seed + 1)
+    T = add_to_pose(p.T, np.concatenate([rng.normal(0, 0.01, 3), rng.normal(0, 0.04, 3)]))
+    for _ in range(8):
+        out = linearise(p.points_body, p.ranges, T, p.maps, DEFAULT)
+        T = add_to_pose(T, -np.linalg.solve(out.H, out.b))
+    off = se3.inverse(p.T) @ T
+    assert np.linalg.norm(off[:3, 3]) < 0.005
+    assert se3.angle_rad(off) < 0.003
+
+
+def test_what_is_not_on_the_map_says_nothing() -> None:
+    p = place(4)
+    for points, maps in ((p.points_body + 100.0, p.maps), (p.points_body, (VoxelMap(0.3), VoxelMap(0.9)))):
+        out = linearise(points, p.ranges, p.T, maps, DEFAULT)
+        assert not out.H.any()
+        assert not out.b.any()
+        assert out[2:5] == (0, 0, 0)
+        assert np.isnan(out.residual_m)
+
+
+@pytest.mark.parametrize("n", [0, 1, 7, 8, 9])
+def test_few_points_do_not_upset_the_chunks(n: int) -> None:
+    p = place(6)
+    few = p.points_body[:n], p.ranges[:n]
+    fast, plain = linearise(*few, p.T, p.maps, DEFAULT), linearise_plainly(*few, p.T, p.maps, DEFAULT)
+    assert fast[2:5] == plain[2:5]
+    assert np.allclose(fast.H, plain.H, rtol=1e-9, atol=1e-9)
+
+
+def test_one_ring_on_a_wall_is_no_plane() -> None:
+    # range noise spreads the returns of a ring along the beams: a plane through them is the scanning cone
+    rng = np.random.default_rng(0)
+    along = rng.uniform(-0.14, 0.14, 300)
+    beam = np.array([0.97, 0.0, 0.26])
+    points = np.array([5.1, 0.15, 0.15]) + along[:, None] * [0, 1.0, 0] + rng.normal(0, 0.02, (300, 1)) * beam
+    fine, coarse = VoxelMap(0.3), VoxelMap(0.9)
+    fine.insert(points, now=0.0)
+    out = linearise(points[:50], np.ones(50), np.eye(4), (fine, coarse), DEFAULT)
+    assert out.planar == 0
+    assert out.other > 0
