@@ -9,6 +9,7 @@ from mineloc import se3
 from mineloc.data import F64
 from mineloc.graph.pose_graph import ROBUST, PoseGraph
 
+_RELINEARIZE_EVERY = 10  # updates, when there is nothing but odometry and gravity
 _SETTLED = 1e-3  # metres, or of a rotation matrix
 _MAX_REPEATS = 10
 
@@ -22,7 +23,7 @@ class CausalEstimate:
     def __init__(self, graph: PoseGraph) -> None:
         params = gtsam.ISAM2Params()
         params.setRelinearizeThreshold(graph.config.relinearize_threshold)
-        params.relinearizeSkip = 1
+        params.relinearizeSkip = _RELINEARIZE_EVERY
         self._graph = graph
         self._isam = gtsam.ISAM2(params)
         self._factors = 0
@@ -50,7 +51,7 @@ class CausalEstimate:
         for _ in range(_MAX_REPEATS if is_robust else 0):
             # each update weighs the robust factors once; they settle only by and by
             before = self._newest
-            self._isam.update()
+            self._isam.update(force_relinearize=True)
             self._newest = self._estimate()
             if np.abs(self._newest - before).max() < _SETTLED:
                 break
