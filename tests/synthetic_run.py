@@ -21,11 +21,9 @@ from mineloc.stages.run_tables import KEYFRAMES, POINTS, fixes_table, pose_colum
 START_NS = 1_790_000_000_123_456_789
 PERIOD_NS = 100_000_000
 STEP_M = 0.15
-CORNERS_M = np.array(
-    [[0, 0, 0], [120, 0, 1], [120, 70, 4], [60, 80, 6], [60, 0, 0.5], [0, 0, 0], [-20, 60, -3], [30, 90, 2], [60, 80, 6]]
-    + [[120, 70, 4], [120, 0, 1], [60, 0, 0.5]],
-    dtype=np.float64,
-)
+_EAST = [[120, 0, 1], [120, 70, 4], [60, 80, 6]]
+_WEST = [[0, 0, 0], [-20, 60, -3], [30, 90, 2], [60, 80, 6]]
+CORNERS_M = np.array([[0, 0, 0], *_EAST, [60, 0, 0.5], *_WEST, *reversed(_EAST[:2]), [60, 0, 0.5]], dtype=np.float64)
 T_BODY_LIDAR = se3.from_xyzw([0.05, 0.0, 0.12], [0, 0, 0, 1])
 
 
@@ -82,7 +80,9 @@ def _truth(n: int) -> np.ndarray:
     smooth = np.stack([np.convolve(np.tile(c, 3), kernel, "same")[len(c) : 2 * len(c)] for c in ring.T], axis=1)
     along = np.mod(np.arange(n) * STEP_M, s[-1])
     position = np.stack([np.interp(along, fine, c, period=s[-1]) for c in smooth.T], axis=1)
-    ahead = np.stack([np.interp(np.mod(along + 0.5, s[-1]), fine, c, period=s[-1]) for c in smooth.T], axis=1) - position
+    ahead = (
+        np.stack([np.interp(np.mod(along + 0.5, s[-1]), fine, c, period=s[-1]) for c in smooth.T], axis=1) - position
+    )
     heading = np.arctan2(ahead[:, 1], ahead[:, 0])
     out = np.tile(np.eye(4), (n, 1, 1))
     out[:, 0, 0], out[:, 0, 1] = np.cos(heading), -np.sin(heading)
@@ -162,7 +162,11 @@ def _fixes(stamps: np.ndarray, smoothed: np.ndarray) -> list[Fix]:
 
 def _timing(what: SyntheticRun) -> dict[str, Any]:
     one = {"total_s": what.poses * 0.0145, "p50_ms": 14.4, "p95_ms": 15.1, "max_ms": 31.0}
-    return {"modules": {"odometry": one, "graph": {**one, "p50_ms": 0.8}}, "sweeps_per_s": 68.9, "real_time_factor": 6.9}
+    return {
+        "modules": {"odometry": one, "graph": {**one, "p50_ms": 0.8}},
+        "sweeps_per_s": 68.9,
+        "real_time_factor": 6.9,
+    }
 
 
 def _manifest(what: SyntheticRun, keyframes: int) -> dict[str, Any]:

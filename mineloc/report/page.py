@@ -60,16 +60,15 @@ def write_report(
     sidecar = out.with_suffix(".json")
     if sidecar == out:
         raise OutputError(out, "is the name of the sidecar", expected="a name ending with .html", todo="rename --out")
-    facts: list[RunFacts] = []
-    for number, path in enumerate(runs):
-        progress(number, len(runs), "runs")
-        facts.append(run_facts(RunFolder.open(path), letter_of(number), config.evaluate))
-    document = report_document(facts, title if title is not None else config.report.title, config)
-    page = _page(facts, document, sidecar.name, where=out)
-    text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-    # both or neither: the page is renamed into place only after the sidecar could be written
+    # The page is renamed into place only after the sidecar; a name that is taken is refused before the work.
     with new_file(out, overwrite=overwrite) as html, new_file(sidecar, overwrite=overwrite) as numbers:
-        html.write_bytes(page)
+        facts: list[RunFacts] = []
+        for number, path in enumerate(runs):
+            progress(number, len(runs), "runs")
+            facts.append(run_facts(RunFolder.open(path), letter_of(number), config.evaluate))
+        document = report_document(facts, title if title is not None else config.report.title, config)
+        html.write_bytes(_page(facts, document, sidecar.name, where=out))
+        text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
         numbers.write_text(text, encoding="utf-8")
     progress(len(runs), len(runs), "runs")
     return out
