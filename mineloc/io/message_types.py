@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 from pathlib import Path
 
 from rosbags.serde import SerdeError
@@ -18,7 +19,6 @@ from mineloc.io.recording import Decoder, Topic
 _MAX_DEFINITION_BYTES = 1 << 18
 _MAX_FIXED_ARRAY = 4096
 _FIXED_ARRAY = re.compile(r"\[\s*([0-9a-zA-Z+]+)\s*\]")
-_STANDARD = {"cdr": Stores.ROS2_HUMBLE, "ros1": Stores.ROS1_NOETIC}
 _ENCODINGS = {("cdr", "ros2msg"), ("cdr", "ros2idl"), ("ros1", "ros1msg")}
 
 
@@ -48,8 +48,11 @@ def make_decoder(path: Path, topic: Topic, definition: str) -> Decoder:
             todo="convert the recording, or record ROS messages",
         )
     try:
-        store = _typestore(topic, definition)
-        store.get_msgdef(topic.msgtype)
+        if definition:
+            store = _compiled(topic.msgtype, topic.schema_encoding, definition)
+        else:
+            store = _standard(topic.encoding)
+            store.get_msgdef(topic.msgtype)
         same = _is_standard(store, topic)
     except Exception as error:
         raise IngestError(
@@ -70,7 +73,7 @@ def make_decoder(path: Path, topic: Topic, definition: str) -> Decoder:
 
 def _is_standard(store: Typestore, topic: Topic) -> bool:
     """Whether a type that ROS itself defines has ROS's fields; what ROS does not know may be anything."""
-    standard = get_typestore(_STANDARD[topic.encoding])
+    standard = _standard(topic.encoding)
     if topic.msgtype not in standard.fielddefs:
         return True
     return all(
@@ -94,20 +97,26 @@ def _decoder(where: str, topic: Topic, store: Typestore) -> Decoder:
     return checked
 
 
-def _typestore(topic: Topic, definition: str) -> Typestore:
-    if not definition:
-        return get_typestore(_STANDARD[topic.encoding])
+@lru_cache(maxsize=2)
+def _standard(encoding: str) -> Typestore:
+    return get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
+
+
+# Parsing and compiling take longer than reading a short recording; all recordings of a fleet have the same definitions.
+@lru_cache(maxsize=32)
+def _compiled(msgtype: str, schema_encoding: str, definition: str) -> Typestore:
     if len(definition) > _MAX_DEFINITION_BYTES:
         raise ValueError("too long")
     for size in _FIXED_ARRAY.findall(definition):
         if not size.isdigit() or int(size) > _MAX_FIXED_ARRAY:
             raise ValueError("array too long")
     store = get_typestore(Stores.EMPTY)
-    if topic.schema_encoding == "ros2idl":
+    if schema_encoding == "ros2idl":
         separator = "=" * 80 + "\n"
         parts = [part.split("\n", 1)[-1] for part in definition.split(separator) if part]
         for text in parts if definition.startswith(separator) else [definition]:
             store.register(get_types_from_idl(text))
     else:
-        store.register(get_types_from_msg(definition, topic.msgtype))
+        store.register(get_types_from_msg(definition, msgtype))
+    store.get_msgdef(msgtype)
     return store
