@@ -111,6 +111,10 @@ def one_line_errors(path: Path) -> Generator[None]:
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise OutputError(path, "the disk is full", todo="free space and run again; nothing was written") from error
+        if error.errno == errno.EFBIG:
+            raise OutputError(
+                path, "larger than the file system allows", todo="choose another --out; nothing was written"
+            ) from error
         if error.errno in (errno.EACCES, errno.EROFS, errno.EPERM):
             raise OutputError(
                 path, f"cannot be written ({os.strerror(error.errno)})", todo="check the permissions of the folder"

@@ -1,16 +1,18 @@
-"""Run in a child under memory and time limits: mutants of a recording, of which each may only be read or refused.
+"""Mutants of a recording, of which each may only be read or refused, in a child under memory and time limits.
 
     python fuzz_recordings.py SEED_FILE COUNT SEED [--ingest]
 
-Prints one line of JSON: how often what happened, the slowest mutant, the peak memory. Leaves the first offender beside
-the seed file.
+The child prints one line of JSON: how often what happened, the slowest mutant, the peak memory. It leaves the first
+offender beside the seed file.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import resource
 import signal
+import subprocess
 import sys
 import time
 from collections import Counter
@@ -67,6 +69,22 @@ def ingest_all(path: Path) -> str:
     out.unlink(missing_ok=True)
     health = ingest(path, out=out).health
     return "recovered" if health.recovered else "read"
+
+
+def fuzz(seed: Path, count: int, number: int, *options: str) -> None:
+    """Run the child and hold it to promise 5."""
+    line = [sys.executable, __file__, str(seed), str(count), str(number), *options]
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(line, capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    result = json.loads(done.stdout)
+    allowed = {"read", "recovered", "IngestError"}
+    if options:
+        allowed |= {"FlightError"}
+    assert set(result["seen"]) <= allowed
+    assert sum(result["seen"].values()) == count
+    assert result["slowest_s"] < 5
+    assert result["peak_mib"] < 1024
 
 
 def _too_slow(signum: int, frame: object) -> None:

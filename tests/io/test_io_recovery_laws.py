@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import recording_files as files
+from fuzz_recordings import fuzz
 from mcap.writer import CompressionType
 
 from mineloc.io.recordings import open_recording
 
-FUZZ = Path(__file__).with_name("fuzz_recordings.py")
 KINDS = ["zstd", "lz4", "none", "unchunked", "crcless", "bag", "db3"]
 
 
@@ -120,21 +116,6 @@ def seed_file(folder: Path, kind: str) -> Path:
         attachments={"a.txt": b"text"},
         **options,
     )
-
-
-def fuzz(seed: Path, count: int, number: int, *options: str) -> None:
-    line = [sys.executable, str(FUZZ), str(seed), str(count), str(number), *options]
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    done = subprocess.run(line, capture_output=True, text=True, env=environment, check=False)
-    assert done.returncode == 0, done.stderr[-2000:]
-    result = json.loads(done.stdout)
-    allowed = {"read", "recovered", "IngestError"}
-    if options:
-        allowed |= {"FlightError"}
-    assert set(result["seen"]) <= allowed
-    assert sum(result["seen"].values()) == count
-    assert result["slowest_s"] < 5
-    assert result["peak_mib"] < 1024
 
 
 @pytest.mark.parametrize("kind", KINDS)
