@@ -21,7 +21,7 @@ from mineloc.sim.path import fly_line, passable
 from mineloc.sim.roadways import RoadwayGraph
 from mineloc.sim.scene import Scene
 from mineloc.sim.schedule import Limits, schedule
-from mineloc.sim.shots import RangeErrors, Returns, Shots, aim, firings_of, measure
+from mineloc.sim.shots import RangeErrors, Returns, Shots, aim, firings_of, measure, points_of
 from mineloc.sim.tour import Step, plan_tour
 
 F64 = NDArray[np.float64]
@@ -150,14 +150,13 @@ class SimulatedFlight:
 
 
 def _as_sweep(shots: Shots, returns: Returns, start_ns: int, period_ns: int) -> Sweep:
-    seen = returns.seen
+    seen = np.flatnonzero(returns.seen)
     offsets = shots.offsets_ns[seen]
     # stamp_ns is the first point that came back, not the first shot
     first = int(offsets[0]) if len(offsets) else 0
-    points = shots.origins_lidar[seen] + returns.range_m[seen, None] * shots.directions_lidar[seen]
     return Sweep(
         stamp_ns=start_ns + first,
-        points_lidar=points.astype(np.float32),
+        points_lidar=points_of(shots, seen, returns.range_m),
         offsets_ns=offsets - first,
         ring=shots.ring[seen],
         intensity=returns.intensity[seen],

@@ -22,7 +22,7 @@ I64 = NDArray[np.int64]
 BLOCK = 24
 FINE_CELLS = 2.5
 # standard deviation of one octave of the lattice noise below, measured over 10⁶ points
-NOISE_SIGMA = 0.256
+NOISE_SIGMA = 0.270
 
 
 def rock_mesh(plan: MinePlan) -> tuple[F64, I64]:

@@ -7,17 +7,18 @@ these links, never on rows and columns.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mineloc.compiled import njit
-from mineloc.sim.scene import Scene
+from mineloc.sim.scene import Crossings, Scene
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 I32 = NDArray[np.int32]
+Bool = NDArray[np.bool_]
 
 # 8 neighbours counter-clockwise from +x; opposite of k is k + 4
 DX = np.array([1, 1, 0, -1, -1, -1, 0, 1])
@@ -58,7 +59,7 @@ class Sheet:
             ]
         )
 
-    def keep(self, mask: NDArray[np.bool_]) -> Sheet:
+    def keep(self, mask: Bool) -> Sheet:
         """Only the masked cells, links to others cut."""
         new = np.full(len(self) + 1, -1, np.int32)
         new[:-1][mask] = np.arange(int(mask.sum()), dtype=np.int32)
@@ -80,7 +81,7 @@ def free_sheet(
 
     Which gaps are free and which are rock is read from the winding of the triangles: a free gap has a floor and a
     roof that face each other. Meshes wound the other way round (facing the rock) are recognised by their majority:
-    there is always at least as much free gap as rock between levels.
+    there is always at least as much free gap as rock between levels. Meshes wound at random are taken to be closed.
 
     Args:
         scene: the mine.
@@ -92,26 +93,46 @@ def free_sheet(
     # off the round numbers on which modelled meshes have their edges
     origin = low_m[:2] + cell_m * np.array([0.37, 0.61])
     columns, rows = (int(np.ceil((high_m[k] - origin[k]) / cell_m)) for k in range(2))
-    found: list[tuple[I64, F64, F64, F64]] = []
+    found: list[_Gaps] = []
     band = max(1, 2_000_000 // max(columns, 1))
     for first in range(0, rows, band):
         row, column = np.divmod(np.arange(columns * min(band, rows - first)), columns)
         start = np.column_stack([origin[0] + column * cell_m, origin[1] + (row + first) * cell_m])
         crossings = scene.verticals(np.column_stack([start, np.full(len(start), low_m[2] - 1.0)]))
-        same = crossings.ray[1:] == crossings.ray[:-1]
-        tall = same & (np.diff(crossings.height_m) >= headroom_m)
-        facing = np.sign(crossings.upward[:-1]) - np.sign(crossings.upward[1:])
-        use = np.flatnonzero(tall & (np.abs(facing) == 2))
-        cell = crossings.ray[use] + first * columns
-        found.append((cell, crossings.height_m[use], crossings.height_m[use + 1], facing[use]))
-    cell, bottom, top, facing = (np.concatenate([part[k] for part in found]) for k in range(4))
-    free = facing == (2.0 if (facing > 0).sum() >= (facing < 0).sum() else -2.0)
-    row, column = np.divmod(cell[free].astype(np.int64), columns)
-    floor, roof = bottom[free] + low_m[2] - 1.0, top[free] + low_m[2] - 1.0
+        found.append(_gaps(crossings, first * columns, headroom_m))
+    gaps = _Gaps(*(np.concatenate([getattr(part, f.name) for part in found]) for f in fields(_Gaps)))
+    free = gaps.free()
+    row, column = np.divmod(gaps.cell[free], columns)
+    floor, roof = gaps.bottom_m[free] + low_m[2] - 1.0, gaps.top_m[free] + low_m[2] - 1.0
     sheet = Sheet(cell_m, origin, column, row, floor, roof, link(column, row, floor, roof, opening_m))
     for _ in range(FILLINGS):
         sheet = _fill(sheet, opening_m)
     return sheet
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Gaps:
+    """Tall gaps between neighbouring crossings of vertical rays: cell, heights, winding (±2: walls face), parity."""
+
+    cell: I64
+    bottom_m: F64
+    top_m: F64
+    facing: F64
+    odd: Bool
+
+    def free(self) -> Bool:
+        """Which gaps are free space. Where half of the triangles are wound at random, every second gap of a ray is."""
+        facing = np.abs(self.facing) == 2
+        if facing.sum() < 0.6 * len(facing):
+            return ~self.odd
+        return self.facing == (2.0 if (self.facing > 0).sum() >= (self.facing < 0).sum() else -2.0)
+
+
+def _gaps(crossings: Crossings, first_cell: int, headroom_m: float) -> _Gaps:
+    ray, height, side = crossings.ray, crossings.height_m, np.sign(crossings.upward)
+    tall = np.flatnonzero((ray[1:] == ray[:-1]) & (np.diff(height) >= headroom_m))
+    odd = (tall - np.searchsorted(ray, ray[tall], "left")) % 2 == 1
+    return _Gaps(ray[tall] + first_cell, height[tall], height[tall + 1], side[tall] - side[tall + 1], odd)
 
 
 def _fill(sheet: Sheet, opening_m: float) -> Sheet:
@@ -153,7 +174,7 @@ def link(column: I64, row: I64, floor_m: F64, roof_m: F64, opening_m: float) -> 
     return np.where(mutual, best, np.int32(-1)).astype(np.int32)
 
 
-def _agree(there: I32, back: I32) -> NDArray[np.bool_]:
+def _agree(there: I32, back: I32) -> Bool:
     return (there >= 0) & (back[there] == np.arange(len(there)))
 
 

@@ -246,6 +246,27 @@ def _measure(
     return seen, ranges, intensity
 
 
+def points_of(shots: Shots, index: I64, range_m: F64) -> F32:
+    """(k, 3) float32 points of some shots in the lidar frame at each one's own time.
+
+    Args:
+        shots: all.
+        index: (k,) which.
+        range_m: (n,) measured ranges of all.
+    """
+    return _points(shots.origins_lidar, shots.directions_lidar, range_m, index)
+
+
+@njit(cache=True, nogil=True)
+def _points(origins: F64, directions: F64, ranges: F64, index: I64) -> F32:
+    out = np.empty((len(index), 3), np.float32)
+    for k in range(len(index)):
+        i = index[k]
+        for a in range(3):
+            out[k, a] = origins[i, a] + ranges[i] * directions[i, a]
+    return out
+
+
 @njit(cache=True, nogil=True)
 def _reflectivity(x: float, y: float, z: float) -> float:
     """Diffuse reflectivity of rock, 8 to 40 %, in patches of metres and decimetres."""

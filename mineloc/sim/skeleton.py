@@ -21,13 +21,16 @@ def thin(links: I32, clearance: F64) -> Bool:
     """(n,) cells of the skeleton: cells are removed in the order of rising clearance.
 
     A cell goes if this neither cuts nor closes anything (Hilditch's crossing number of its 8 neighbours is one) and it
-    is not the end of a line. Working on links, it needs no picture, so it does not mind even widths nor levels.
+    is not the end of a line. Equals go in a shuffled order: the ridge of an even width is two cells wide, and taken in
+    rows it would come off from its end, cell by cell, with nothing left. Working on links, it needs no picture, so
+    levels may lie over one another.
 
     Args:
         links: (n, 8) neighbours, counter-clockwise from +x, -1: none.
         clearance: (n,) distance to the nearest rock.
     """
-    return _thin(links, np.argsort(clearance, kind="stable"))
+    shuffled = np.random.default_rng(0).permutation(len(clearance))
+    return _thin(links, np.lexsort((shuffled, clearance)))
 
 
 @njit(cache=True)
