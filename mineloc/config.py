@@ -89,6 +89,7 @@ class OdometryConfig(Section):
     """The mineloc front end. Sigmas are one standard deviation; densities are per root hertz."""
 
     use_imu: bool = Field(default=True, description="false: constant velocity even if the flight has an IMU")
+    settle_s: float = Field(default=1.0, ge=0, description="so much of the IMU's beginning levels the drone")
     fine_voxel_m: float = Field(default=0.3, ge=0.1, description="edge of the map's finer patches")
     coarse_voxel_m: float = Field(
         default=0.9, ge=0.1, description="edge of the patches that stand in for poor fine ones"

@@ -74,6 +74,32 @@ class Clock:
             yield item
 
 
+def settled(steps: Iterable[tuple[Sweep, ImuSamples]], *, first_s: float) -> Generator[tuple[Sweep, ImuSamples]]:
+    """The same steps, but the first one has the inertial samples of the first `first_s` seconds.
+
+    A drone stands for a moment before it takes off, and a second of gravity levels it five times better than the tenth
+    of a second of one sweep. So the first poses of a flight are known a second later than the others.
+    """
+    source = iter(steps)
+    held: list[tuple[Sweep, ImuSamples]] = []
+    for item in source:
+        held.append(item)
+        if item[0].end_ns - held[0][0].stamp_ns >= first_s * 1e9:
+            break
+    if held:
+        parts = [imu for _, imu in held]
+        held[0] = (held[0][0], _joined(parts))
+    yield from held
+    yield from source
+
+
+def _joined(parts: Sequence[ImuSamples]) -> ImuSamples:
+    stamps = np.concatenate([part.stamps_ns for part in parts])
+    rows = np.concatenate([[True], np.diff(stamps) > 0]) if len(stamps) else np.zeros(0, np.bool_)
+    gyro, accel = (np.concatenate([getattr(part, name) for part in parts]) for name in ("gyro_radps", "accel_mps2"))
+    return ImuSamples(stamps[rows], gyro[rows], accel[rows])
+
+
 def levelled_origin(T_odom_body: F64, *, up_is_known: bool) -> F64:
     """`T_map_odom` that puts the first body pose at the origin with heading zero.
 

@@ -14,7 +14,7 @@ from mineloc.graph.batch import solve
 from mineloc.graph.causal import CausalEstimate
 from mineloc.graph.pose_graph import PoseGraph
 from mineloc.graph.spread import spread
-from mineloc.localize.localization import Clock, FlightData, Localization, levelled_origin
+from mineloc.localize.localization import Clock, FlightData, Localization, levelled_origin, settled
 from mineloc.odometry.front_end import FrontEnd
 from mineloc.progress import Progress
 from mineloc.sweep.range_filter import within_range
@@ -44,7 +44,8 @@ class RelativeMethod:
         Raises:
             FlightError: fewer than two sweeps, or time goes backwards.
         """
-        for sweep, imu in self._clock.waiting(flight.steps):
+        steps = settled(flight.steps, first_s=self._config.odometry.settle_s)
+        for sweep, imu in self._clock.waiting(steps):
             with self._clock.of("odometry"):
                 step = self._front_end.step(within_range(sweep, self._config.sweep), imu)
             with self._clock.of("graph_online"):

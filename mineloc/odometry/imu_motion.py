@@ -15,6 +15,11 @@ GAP_S = 0.05
 _START_SIGMAS = np.repeat([0.02, 1e-4, 1.0, 0.003, 0.05], 3)
 
 
+REST_RADPS, REST_MPS2 = 0.02, 0.1
+"""At rest the gyro's mean is below the first, and the mean force of two halves differs by less than the second."""
+FEWEST = 20
+
+
 class ImuMotion:
     """Body = IMU. Errors: [rotation, position, velocity, gyro bias, accelerometer bias], 15 of them; z of odom is up.
 
@@ -22,7 +27,7 @@ class ImuMotion:
     LiDARs (METHOD 4.1, 7.3).
 
     Args:
-        first: samples of the first moments; their mean says where up is and, if the drone is at rest, the gyro bias.
+        first: samples of the first moments; the mean of those at rest says where up is, and the gyro bias.
         T_odom_body: (4, 4) start pose; its heading and position are kept, its roll and pitch are levelled.
 
     Raises:
@@ -36,11 +41,12 @@ class ImuMotion:
         self._samples = ImuSamples.empty()
         self.stamp_ns = stamp_ns
         start = np.eye(4) if T_odom_body is None else T_odom_body
-        up_odom = start[:3, :3] @ first.accel_mps2.mean(axis=0)
+        calm = _calm_part(first)
+        up_odom = start[:3, :3] @ calm.accel_mps2.mean(axis=0)
         self.T_odom_body = se3.from_rt(se3.rotation_between(up_odom, [0, 0, 1]) @ start[:3, :3], start[:3, 3])
         self.velocity_mps = np.zeros(3)
-        rate = first.gyro_radps.mean(axis=0)
-        self.gyro_bias_radps = rate if float(np.linalg.norm(rate)) < 0.02 else np.zeros(3)
+        rate = calm.gyro_radps.mean(axis=0)
+        self.gyro_bias_radps = rate if float(np.linalg.norm(rate)) < REST_RADPS else np.zeros(3)
         self.accel_bias_mps2 = np.zeros(3)
         self.covariance: F64 = np.diag(_START_SIGMAS**2)
         self._predicted = self._state()
@@ -57,10 +63,6 @@ class ImuMotion:
 
     def predict(self, start_ns: int, end_ns: int) -> BodyPath:
         """Integrate to `end_ns`. Beyond the samples the last ones are held, and the covariance says so."""
-        if end_ns <= self.stamp_ns:
-            self._predicted = self._state()
-            stamps = np.array([min(start_ns, end_ns) - 1, end_ns], dtype=np.int64)
-            return BodyPath(stamps, np.stack([self.T_odom_body] * 2))
         stamps, gyro, accel = self._nodes(end_ns)
         rates, forces = gyro - self.gyro_bias_radps, accel - self.accel_bias_mps2
         times_s, guessed = np.asarray((stamps - self.stamp_ns) * 1e-9, np.float64), self._guessed(stamps)
@@ -119,3 +121,15 @@ class ImuMotion:
         since = np.where(before >= 0, known[np.maximum(before, 0)], start)
         until = np.where(after < len(known), known[np.minimum(after, len(known) - 1)], end)
         return (until - since) * 1e-9 > GAP_S
+
+
+def _calm_part(first: ImuSamples) -> ImuSamples:
+    """The longest beginning in which the drone seems to rest, halving while it does not; at least `FEWEST` samples."""
+    n = len(first)
+    while n > FEWEST:
+        early, late = first.accel_mps2[: n // 2].mean(axis=0), first.accel_mps2[n // 2 : n].mean(axis=0)
+        turning = float(np.linalg.norm(first.gyro_radps[:n].mean(axis=0)))
+        if turning < REST_RADPS and float(np.linalg.norm(late - early)) < REST_MPS2:
+            break
+        n //= 2
+    return ImuSamples(first.stamps_ns[:n], first.gyro_radps[:n], first.accel_mps2[:n])
