@@ -26,6 +26,7 @@ SetOption = Annotated[list[str] | None, typer.Option("--set", help="Override one
 JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable results on stdout; all else on stderr.")]
 LocalOption = Annotated[bool, typer.Option("--local", help="Without Prefect.")]
 ServerOption = Annotated[str | None, typer.Option("--server", help="Address of a running Prefect server.")]
+_INTERRUPTED = 130  # what typer makes of Ctrl-C
 
 
 @app.callback()
@@ -250,15 +251,17 @@ def _survey(
 
 
 def main() -> None:
-    """Entry point: exit code 0 done, 1 mineloc said no (one line), 2 usage, 130 interrupted."""
+    """Entry point: exit code 0 done, 1 mineloc said no or was interrupted (one line), 2 usage."""
     try:
         app(standalone_mode=True)
     except MinelocError as error:
         sys.stderr.write(f"mineloc: {error}\n")
         raise SystemExit(1) from None
-    except KeyboardInterrupt:
-        sys.stderr.write("mineloc: interrupted; nothing half-written was left\n")
-        raise SystemExit(1) from None
+    except SystemExit as end:
+        if end.code == _INTERRUPTED:
+            sys.stderr.write("mineloc: interrupted; nothing half-written was left, run again to go on\n")
+            raise SystemExit(1) from None
+        raise
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ from __future__ import annotations
 from types import TracebackType
 from typing import Any
 
-from rich.box import SIMPLE
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -103,7 +102,9 @@ def summary_table(rows: list[dict[str, Any]]) -> Table:
     """The runs' figures; unknown ones are a dash."""
     alignments = sorted({row["alignment"] for row in rows if row["alignment"]})
     table = Table(
-        box=SIMPLE,
+        box=None,
+        padding=(0, 2, 0, 0),
+        header_style="bold",
         caption=f"position errors after alignment: {', '.join(alignments)}" if alignments else None,
         caption_justify="left",
     )
