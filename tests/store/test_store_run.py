@@ -106,11 +106,16 @@ def test_what_is_made_anew_differently_leaves_no_damaged_object_behind(store):
     assert store.verify().is_sound
 
 
-def test_a_damaged_record_counts_as_none(store):
+@pytest.mark.parametrize("still_json", [False, True])
+def test_a_damaged_record_counts_as_none(store, still_json):
     work = Work(a=b"1")
     store.run(ACTION, work)
-    flip(store.records.paths()[0])
-    assert store.verify().records == tuple(store.records.paths())
+    (path,) = store.records.paths()
+    if still_json:
+        path.write_text(path.read_text().replace('"size_bytes":1', '"size_bytes":3'))
+    else:
+        flip(path)
+    assert store.verify().records == (path,)
     assert not store.run(ACTION, work).hit
     assert store.verify().is_sound
 
