@@ -27,7 +27,7 @@ from mineloc.sweep.voxel_grid import mean_by_label, number_voxels, voxel_centroi
 
 MIN_IMU_SAMPLES = 5
 IMU_GRACE_SWEEPS = 20
-"""An IMU that starts so many sweeps late is still taken; the map starts anew then."""
+"""An IMU that starts so many sweeps late is still taken; the map starts anew then, levelled."""
 FORGET_EVERY = 100
 _CONVERGED_RAD, _CONVERGED_M = 2e-5, 2e-4
 
@@ -50,8 +50,8 @@ class _Registered:
 class MinelocFrontEnd:
     """`FrontEnd` for every method but the baselines.
 
-    The odom frame's origin is the body at the first sweep; with an IMU its z axis is up. Poses are true for the time of
-    a sweep's last point.
+    The odom frame's origin is the body at the first sweep; with an IMU from the start its z axis is up. Poses are true
+    for the time of a sweep's last point.
 
     Args:
         config, keyframes: thresholds and noise.
@@ -64,6 +64,7 @@ class MinelocFrontEnd:
         self._weighting = Weighting.of(config)
         self._T_lidar_imu = calibration.T_lidar_imu
         self._T_body_lidar: F64 = np.eye(4)
+        self._T_odom_level: F64 = np.eye(4)  # differs when the IMU came late: its odom is level, the one told is not
         self._motion: MotionModel | None = None
         self._maps = self._new_maps()
         self._sweeps = 0
@@ -119,12 +120,15 @@ class MinelocFrontEnd:
                 todo="check its unit (g instead of m/s²?) in the sequence file, or --set odometry.use_imu=false",
             )
         noise = ImuNoise(c.gyro_radps, c.accel_mps2, c.gyro_walk_radps2, c.accel_walk_mps3)
-        # the state begins just before the sweep; a late start keeps heading and place, but not the unlevelled map
-        start_ns = sweep.stamp_ns - 1 if before is None else max(before.stamp_ns, sweep.stamp_ns - 1)
-        T = None if before is None else before.T_odom_body @ self._T_lidar_imu
         self._T_body_lidar = se3.inverse(self._T_lidar_imu)
         self._maps = self._new_maps()
-        return ImuMotion(start_ns, imu, noise=noise, T_odom_body=T)
+        if not isinstance(before, ConstantVelocity):
+            return ImuMotion(sweep.stamp_ns - 1, imu, noise=noise)
+        T_odom_imu = before.T_odom_body @ self._T_lidar_imu
+        motion = ImuMotion(before.stamp_ns, imu, noise=noise, T_odom_body=T_odom_imu)
+        self._T_odom_level = T_odom_imu @ se3.inverse(motion.T_odom_body)
+        motion.velocity_mps = self._T_odom_level[:3, :3].T @ before.velocity_mps
+        return motion
 
     def _deskewed(self, sweep: Sweep, path: BodyPath) -> F32:
         """(n, 3) lidar points as if all were measured at the sweep's end."""
@@ -184,7 +188,7 @@ class MinelocFrontEnd:
                 patches.forget(self._flown_m - self._config.forget_after_m)
 
     def _told(self, motion: MotionModel, cloud: F32, registered: _Registered, reason: str) -> OdometryStep:
-        T_odom_lidar = motion.T_odom_body @ self._T_body_lidar
+        T_odom_lidar = self._T_odom_level @ motion.T_odom_body @ self._T_body_lidar
         last = registered.last
         degeneracy = None
         if last is not None:
@@ -208,7 +212,7 @@ class MinelocFrontEnd:
         )
 
     def _keyframe(self, motion: MotionModel, cloud: F32, T_odom_lidar: F64) -> Keyframe:
-        up = T_odom_lidar[2, :3].copy() if isinstance(motion, ImuMotion) else None
+        up = (motion.T_odom_body @ self._T_body_lidar)[2, :3] if isinstance(motion, ImuMotion) else None
         points = voxel_centroids(cloud, self._keyframe_config.voxel_m)
         return Keyframe(self._selector.index, motion.stamp_ns, T_odom_lidar, points, up)
 
