@@ -91,6 +91,9 @@ class BagRecording:
             except Exception as error:  # noqa: BLE001  # as above
                 self._refuse(error, f"reading message {count + 1}")
             count += 1
+            # a damaged database may hold anything in any column
+            if not isinstance(data, bytes | memoryview) or not isinstance(log_ns, int):  # pyright: ignore[reportUnnecessaryIsInstance]
+                self._refuse(ValueError("not a message"), f"reading message {count}")
             yield RawMessage(self.topics[connection.topic], log_ns, log_ns, data, decoders[connection.topic], _NO_NOTES)
 
     def _decoder(self, connection: Connection) -> Decoder:

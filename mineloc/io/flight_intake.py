@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -119,7 +119,8 @@ def _static_calibration(recording: Recording, roles: Roles) -> tuple[Calibration
             until_ns = raw.log_ns + _TF_STATIC_SPAN_NS if until_ns is None else until_ns
             if raw.log_ns > until_ns:
                 break
-            frames.add(raw.message)
+            with suppress(IngestError):  # one that does not decode places nothing
+                frames.add(raw.message)
     return frames.calibration(_frame_of(recording, roles.lidar), _frame_of(recording, roles.imu))
 
 
@@ -128,7 +129,8 @@ def _frame_of(recording: Recording, topic: Topic | None) -> str:
         return ""
     with closing(_stream(recording, [topic.name])) as messages:
         for raw in messages:
-            return frame_name(raw.message.header.frame_id)
+            with suppress(IngestError):
+                return frame_name(raw.message.header.frame_id)
     return ""
 
 
@@ -188,7 +190,8 @@ class FlightIntake:
         Raises:
             IngestError: clouds that cannot be understood, wrong units, time that goes back by more than a second.
         """
-        with closing(_stream(self._recording, self._takers)) as messages:
+        # absurd values overflow; what comes of them is looked at
+        with closing(_stream(self._recording, self._takers)) as messages, np.errstate(all="ignore"):
             for raw in messages:
                 taker = self._takers[raw.topic]
                 taker.take(raw)
@@ -196,7 +199,8 @@ class FlightIntake:
                     raise self._goes_back(taker.monitor)
                 step(raw)
         for taker in self._takers.values():
-            taker.flush()
+            with np.errstate(all="ignore"):
+                taker.flush()
             if taker.monitor.deepest_ns > _DEEPEST_NS:
                 raise self._goes_back(taker.monitor)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
@@ -26,6 +27,9 @@ from mineloc.io.topic_monitor import TopicMonitor
 
 # Small messages are decoded so many at once.
 _PORTION = 256
+# What nouns and encoders raise over values that are beyond any clock or frame: a checksum holds for what was written,
+# and a driver may write anything.
+ABSURD = (ValueError, ArithmeticError, struct.error)
 
 
 class Intake(Protocol):
@@ -56,16 +60,18 @@ class Intake(Protocol):
 
 
 class Unreadable:
-    """Counts messages whose bytes do not fit their schema, and keeps the first error."""
+    """Counts messages whose bytes do not fit their schema, or whose values fit no clock, and keeps the first error."""
 
     def __init__(self) -> None:
         self.count = 0
         self.first: IngestError | None = None
 
-    def add(self, error: IngestError) -> None:
+    def add(self, error: Exception, where: str) -> None:
         """One more."""
         self.count += 1
-        self.first = error if self.first is None else self.first
+        if self.first is None:
+            told = error if isinstance(error, IngestError) else None
+            self.first = told or IngestError(where, f"values that no sensor sends ({error})", expected="measurements")
 
 
 class LidarIntake:
@@ -116,8 +122,14 @@ class LidarIntake:
         try:
             message = raw.message
         except IngestError as error:
-            self.unreadable.add(error)
+            self.unreadable.add(error, raw.topic)
             return
+        try:
+            self._take(raw, message)
+        except ABSURD as error:
+            self.unreadable.add(error, raw.topic)
+
+    def _take(self, raw: RawMessage, message: object) -> None:
         if self._pass_on(raw, message) or self._rewrite(raw, message):
             return
         for decoded in self._decoder.decode(message, log_ns=raw.log_ns):
@@ -128,8 +140,11 @@ class LidarIntake:
 
     def flush(self) -> None:
         """See `Intake`."""
-        for decoded in self._decoder.finish():
-            self._write(decoded)
+        try:
+            for decoded in self._decoder.finish():
+                self._write(decoded)
+        except ABSURD as error:
+            self.unreadable.add(error, self.monitor.topic.name)
         self.monitor.catch_up()
 
     def _pass_on(self, raw: RawMessage, message: object) -> bool:
@@ -221,7 +236,18 @@ class _Portions:
         if held:
             logs = np.array([raw.log_ns for raw in held], dtype=np.int64)
             self.monitor.take(header_stamps_ns(held), logs)
+            self._write_all(held)
+
+    def _write_all(self, held: list[RawMessage]) -> None:
+        """All at once; if something in them is absurd one by one, to lose only what is."""
+        try:
             self._write(held)
+        except ABSURD as error:
+            if len(held) == 1:
+                self.unreadable.add(error, held[0].topic)
+                return
+            for raw in held:
+                self._write_all([raw])
 
     def _write(self, held: list[RawMessage]) -> None:
         raise NotImplementedError
@@ -233,7 +259,7 @@ class _Portions:
             try:
                 _ = raw.message
             except IngestError as error:
-                self.unreadable.add(error)
+                self.unreadable.add(error, raw.topic)
             else:
                 good.append(raw)
         return good
@@ -295,7 +321,7 @@ class PoseIntake(_Portions):
             try:
                 message = raw.message
             except IngestError as error:
-                self.unreadable.add(error)
+                self.unreadable.add(error, raw.topic)
                 continue
             self._decoder.add(message)
         poses = self._decoder.take()

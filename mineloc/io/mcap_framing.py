@@ -26,6 +26,7 @@ _MESSAGE = struct.Struct("<BQHIQQ")
 _CHUNK = struct.Struct("<QQQII")
 _U64 = struct.Struct("<Q")
 _MESSAGE_FIELDS = 22
+_LATEST_NS = 2**63 - 1
 _CHUNK_FIXED_BYTES = _CHUNK.size + _U64.size
 MAX_RECORD_BYTES = 256 << 20
 
@@ -197,6 +198,8 @@ def messages_in(
             if length < _MESSAGE_FIELDS:
                 raise RecordError("a message record without its header")
             _, _, channel_id, _, log_ns, publish_ns = _MESSAGE.unpack_from(view, position)
+            if log_ns > _LATEST_NS:
+                raise RecordError("a message after the year 2262")
             yield MessageRecord(channel_id, log_ns, publish_ns, view[start + _MESSAGE_FIELDS : start + length])
         elif opcode == Opcode.SCHEMA and schemas is not None:
             _define(schemas, parse_record(Schema, view[start : start + length]))

@@ -508,15 +508,17 @@ def test_the_command_prints_a_table_or_json_and_exits_with_1_in_one_line(tmp_pat
 # --- memory and hostile files --------------------------------------------------------------------------------------
 
 
-def test_mutants_of_a_recording_become_a_flight_or_are_refused(tmp_path) -> None:
+@pytest.mark.parametrize("crcs", [True, False])
+def test_mutants_of_a_recording_become_a_flight_or_are_refused(tmp_path, crcs) -> None:
     entries = in_order(clouds(sweeps(4, columns=8)), samples(30))
-    fuzz(files.write_mcap(tmp_path / "seed.mcap", entries, chunk_size=2000), 40, 1, "--ingest")
+    fuzz(files.write_mcap(tmp_path / "seed.mcap", entries, chunk_size=2000, enable_crcs=crcs), 40, 1, "--ingest")
 
 
 @pytest.mark.slow
-def test_5000_mutants_of_a_recording_become_a_flight_or_are_refused(tmp_path) -> None:
+@pytest.mark.parametrize("crcs", [True, False])
+def test_5000_mutants_of_a_recording_become_a_flight_or_are_refused(tmp_path, crcs) -> None:
     entries = in_order(clouds(sweeps(4, columns=8)), samples(30))
-    fuzz(files.write_mcap(tmp_path / "seed.mcap", entries, chunk_size=2000), 5000, 2, "--ingest")
+    fuzz(files.write_mcap(tmp_path / "seed.mcap", entries, chunk_size=2000, enable_crcs=crcs), 5000, 2, "--ingest")
 
 
 @pytest.mark.slow
