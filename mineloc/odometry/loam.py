@@ -196,8 +196,8 @@ class LoamFrontEnd:
         keyframe, relative, degeneracy = None, None, None
         hessian = np.zeros((6, 6))
         if registration is not None:
-            T_target_lidar = registration.T_odom_lidar
-            hessian, firm = firm_hessian(registration.matches, T_target_lidar, huber_m=self._config.huber_m)
+            # matches between two sweeps are never firm: where the map gave none, nothing is claimed
+            hessian, firm = firm_hessian(registration.matches, registration.T_odom_lidar, huber_m=self._config.huber_m)
             degeneracy = degeneracy_of(hessian, firm, weak_ratio=_WEAK_RATIO)
         if self._selector.consider(track.stamp_ns, track.T_odom_lidar):
             index = self._selector.index

@@ -18,9 +18,10 @@ from mineloc.data import F64
 Bool = NDArray[np.bool_]
 
 _FIRST_RADIUS = 1e4
-_LARGEST_RADIUS = 1e16
+_LARGEST_RADIUS = 1e8
 _SMALL_STEP = 1e-8
-"""Ceres' trust region at the start and at most, and its parameter tolerance."""
+"""Ceres' trust region at the start and its parameter tolerance; the region stays small enough that a system without
+information in some direction can still be solved."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

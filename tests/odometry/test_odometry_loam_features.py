@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
@@ -183,6 +184,13 @@ def test_empty_and_short_sweeps_have_no_features() -> None:
         sweep = Sweep(0, np.ones((n, 3), np.float32), None, np.zeros(n, np.uint16))
         found = features(sweep)
         assert [len(f) for f in (found.sharp, found.less_sharp, found.flat, found.less_flat)] == [0, 0, 0, 0]
+
+
+def test_points_at_the_sensor_itself_do_no_harm() -> None:
+    sweep = room_sweep()
+    points = sweep.points_lidar.copy()
+    points[::97] = 0.0
+    assert len(features(replace(sweep, points_lidar=points)).flat) > 300
 
 
 def test_the_order_of_rings_does_not_matter_but_times_follow() -> None:

@@ -130,6 +130,16 @@ def test_nothing_moves_without_iterations_or_when_all_is_remapped() -> None:
     assert np.allclose(solve(m, start, iterations=5, huber_m=0.1, min_eigenvalue=1e12)[0], start)
 
 
+def test_a_single_plane_is_solved_where_it_can_be() -> None:
+    p = np.random.default_rng(0).uniform(-5, 5, (50, 3)) * [1, 1, 0]
+    up = np.tile([0.0, 0.0, 1.0], (50, 1))
+    plane = Matches(p, p - [0, 0, 0.05], up, np.zeros(50, np.bool_), np.ones(50, np.bool_))
+    found, residual_m = solve(plane, np.eye(4), iterations=200, huber_m=0.1)
+    assert found[2, 3] == pytest.approx(-0.05, abs=1e-6)
+    assert np.abs(found[:2, 3]).max() < 1e-3  # unseen: it stays
+    assert residual_m < 1e-6
+
+
 def test_only_firm_matches_count_as_knowledge() -> None:
     m, T = matches(8)
     h, n = firm_hessian(m, T, huber_m=0.1)
