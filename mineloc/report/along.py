@@ -9,11 +9,11 @@ from typing import Literal
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
 
 from mineloc.data import F64, I64
-from mineloc.report.svg import BLACK, DASHES, ORANGE, SERIES, WIDTH_IN, draw, keep_peaks
-
-_MAX_BANDS = 400
+from mineloc.report.svg import BLACK, COLUMNS, DASHES, ORANGE, SERIES, WIDTH_IN, draw, keep_peaks
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,14 +52,23 @@ class Curve:
     y: F64
 
 
-def curves(key: str, lines: Sequence[Curve], *, bands: Sequence[Band], x_label: str, y_label: str, alt: str) -> str:
+def curves(
+    key: str,
+    lines: Sequence[Curve],
+    *,
+    bands: Sequence[Band],
+    x_label: str,
+    y_label: str,
+    alt: str,
+    detail: float = 1.0,
+) -> str:
     """SVG of curves over the metres flown, from zero, with stretches shaded."""
 
     def paint(figure: Figure) -> None:
         axes = figure.add_subplot()
         shade(axes, bands)
         for i, line in enumerate(lines):
-            pick = keep_peaks(line.along_m, line.y)
+            pick = keep_peaks(line.along_m, line.y, columns=round(COLUMNS * detail))
             axes.plot(
                 line.along_m[pick],
                 line.y[pick],
@@ -80,12 +89,16 @@ def curves(key: str, lines: Sequence[Curve], *, bands: Sequence[Band], x_label: 
 
 def shade(axes: Axes, bands: Sequence[Band]) -> None:
     """Shade stretches over the whole height: degenerate ones orange, untrusted ones grey."""
-    named: set[str] = set()
-    # the longest are the ones that can be seen
-    for band in sorted(sorted(bands, key=lambda b: b.from_m - b.to_m)[:_MAX_BANDS], key=lambda b: b.from_m):
-        label = band.kind if band.kind not in named else None
-        named.add(band.kind)
-        if band.kind == "degenerate":
-            axes.axvspan(band.from_m, band.to_m, color=ORANGE, alpha=0.3, linewidth=0, label=label)
-        else:
-            axes.axvspan(band.from_m, band.to_m, color=BLACK, alpha=0.45, linewidth=0.8, label=label)
+    for kind, color, alpha in (("degenerate", ORANGE, 0.3), ("untrusted", BLACK, 0.45)):
+        spans = np.array([(band.from_m, band.to_m) for band in bands if band.kind == kind])
+        if len(spans):
+            # one path for all of them: a figure with hundreds stays small
+            corners = np.stack([spans[:, [0, 0, 1, 1, 0]], np.tile([0.0, 1.0, 1.0, 0.0, 0.0], (len(spans), 1))], axis=2)
+            codes = np.tile([Path.MOVETO, *[Path.LINETO] * 3, Path.CLOSEPOLY], len(spans))
+            outline = Path(corners.reshape(-1, 2), codes)
+            # the line keeps a stretch visible that is shorter than a pixel
+            axes.add_patch(
+                PathPatch(
+                    outline, color=color, alpha=alpha, linewidth=0.6, label=kind, transform=axes.get_xaxis_transform()
+                )
+            )

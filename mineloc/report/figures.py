@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mineloc.data import F64
 from mineloc.report.along import Band, Curve, curves
 from mineloc.report.facts import RunFacts
 from mineloc.report.plan import Colored, density, long_section, plan_view
@@ -50,12 +51,12 @@ def run_figures(facts: RunFacts, key: str, *, detail: float = 1.0) -> RunFigures
             colored=_colored(facts),
             detail=detail,
         ),
-        section=_section(facts, f"{key}-section", estimate[:, 2]),
-        along=_along(facts, f"{key}-along"),
+        section=_section(facts, f"{key}-section", estimate[:, 2], detail),
+        along=_along(facts, f"{key}-along", detail),
     )
 
 
-def methods_figure(runs: Sequence[RunFacts]) -> str | None:
+def methods_figure(runs: Sequence[RunFacts], *, detail: float = 1.0) -> str | None:
     """The smoothed errors of several runs in one SVG, named by their letters; None below two."""
     lines = [
         Curve(facts.values["letter"], one.shown.path_m, one.shown.error_m)
@@ -65,7 +66,7 @@ def methods_figure(runs: Sequence[RunFacts]) -> str | None:
     if len(lines) < 2:
         return None
     alt = "Position error of the runs along the flight"
-    return curves("methods", lines, bands=[], x_label=_FLOWN, y_label="position error (m)", alt=alt)
+    return curves("methods", lines, bands=[], x_label=_FLOWN, y_label="position error (m)", alt=alt, detail=detail)
 
 
 def _colored(facts: RunFacts) -> Colored | None:
@@ -88,12 +89,18 @@ def _bands(facts: RunFacts) -> list[Band]:
     ]
 
 
-def _section(facts: RunFacts, key: str, estimate_z: np.ndarray) -> str:
+def _section(facts: RunFacts, key: str, estimate_z: F64, detail: float) -> str:
     smoothed = facts.comparisons.get("smoothed")
     if smoothed is None:
         way = facts.run.smoothed
         return long_section(
-            key, along_m=way.path_m, smoothed_z=estimate_z, reference_z=None, bands=_bands(facts), x_label=_FLOWN
+            key,
+            along_m=way.path_m,
+            smoothed_z=estimate_z,
+            reference_z=None,
+            bands=_bands(facts),
+            x_label=_FLOWN,
+            detail=detail,
         )
     compared = estimate_z[np.isin(facts.run.smoothed.stamps_ns, smoothed.shown.stamps_ns)]
     return long_section(
@@ -103,14 +110,16 @@ def _section(facts: RunFacts, key: str, estimate_z: np.ndarray) -> str:
         reference_z=compared - smoothed.shown.offset_m[:, 2],
         bands=_bands(facts),
         x_label=_FLOWN,
+        detail=detail,
     )
 
 
-def _along(facts: RunFacts, key: str) -> str | None:
+def _along(facts: RunFacts, key: str, detail: float) -> str | None:
     if facts.comparisons:
         lines = [Curve(name, one.shown.path_m, one.shown.error_m) for name, one in facts.comparisons.items()]
         alt = "Position error along the flight"
-        return curves(key, lines, bands=_bands(facts), x_label=_FLOWN, y_label="position error (m)", alt=alt)
+        y_label = "position error (m)"
+        return curves(key, lines, bands=_bands(facts), x_label=_FLOWN, y_label=y_label, alt=alt, detail=detail)
     keyframes = facts.run.keyframes
     lines: list[Curve] = []
     for column, name in (("sigma_xy_m", "horizontal"), ("sigma_z_m", "vertical")):
@@ -120,5 +129,5 @@ def _along(facts: RunFacts, key: str) -> str | None:
             lines.append(Curve(name, along, known[column].to_numpy()))
     if not lines:
         return None
-    alt = "Claimed uncertainty along the flight"
-    return curves(key, lines, bands=_bands(facts), x_label=_FLOWN, y_label="claimed uncertainty, 1σ (m)", alt=alt)
+    alt, y_label = "Claimed uncertainty along the flight", "claimed uncertainty, 1σ (m)"
+    return curves(key, lines, bands=_bands(facts), x_label=_FLOWN, y_label=y_label, alt=alt, detail=detail)

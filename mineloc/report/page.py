@@ -23,8 +23,8 @@ from mineloc.stages.run_folder import RunFolder
 
 SCHEMA = "mineloc.report/1"
 MAX_BYTES = 1_000_000
-_DETAILS = (1.0, 0.7, 0.5, 0.35, 0.2)
-_ROWS = 20
+_DETAILS = (1.0, 0.8, 0.6, 0.45, 0.35, 0.25, 0.15, 0.1)
+_ROWS = 15
 _ALIGNED = {"none": "nothing aligned", "origin": "first pose laid on first pose", "se3": "fitted as a whole"}
 
 
@@ -97,13 +97,17 @@ def letter_of(number: int) -> str:
 
 def _page(facts: Sequence[RunFacts], document: Mapping[str, Any], sidecar: str, *, where: Path) -> bytes:
     """The page with as much detail in its figures as fits."""
-    size = 0
+    size, fitting = 0, 1.0
     for detail in _DETAILS:
+        if detail > fitting:
+            continue
         figures = [run_figures(one, f"run{number}", detail=detail) for number, one in enumerate(facts)]
-        page = _rendered(document, figures, methods_figure(facts), sidecar).encode()
+        page = _rendered(document, figures, methods_figure(facts, detail=detail), sidecar).encode()
         size = len(page)
         if size <= MAX_BYTES:
             return page
+        # the size falls a little slower than the detail: no use in drawing what cannot fit
+        fitting = max(detail * MAX_BYTES / size, _DETAILS[-1])
     raise OutputError(
         where,
         f"{len(facts)} runs make a page of {size / 1e6:.1f} MB",

@@ -7,19 +7,22 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
 
-from mineloc.data import F64, I64
+from mineloc.data import F64, I64, Bool
 from mineloc.report.along import Band, shade
-from mineloc.report.svg import BLACK, BLUE, WIDTH_IN, draw, error_colors, keep_peaks
+from mineloc.report.svg import BLACK, BLUE, COLUMNS, WIDTH_IN, draw, error_colors, keep_peaks
 from mineloc.stages.run_folder import RunFolder
 
 _PIXELS = 1000  # longer side of the raster of points
 _MIN_PIXEL_M = 0.1
 _CHUNK = 1 << 18
 _MAX_VERTICES = 2000
-_COLORED_DPI = 220
+_LEVELS = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,7 +110,6 @@ def plan_view(
     height = float(np.clip(5.6 * (y1 - y0) / (x1 - x0) + 0.75, 2.0, 6.7))
 
     def paint(figure: Figure) -> None:
-        figure.set_dpi(_COLORED_DPI * detail)
         axes = figure.add_subplot()
         axes.set_aspect("equal")
         axes.set_xlim(x0, x1)
@@ -115,14 +117,14 @@ def plan_view(
         if background is not None:
             _paint_density(axes, background)
         if reference is not None:
-            thin = reference[_spread(len(reference))]
+            thin = reference[_spread(len(reference), detail)]
             axes.plot(thin[:, 0], thin[:, 1], color=BLACK, linewidth=0.5, label="reference")
         if colored is None or len(colored.where) < len(estimate):
-            thin = estimate[_spread(len(estimate))]
+            thin = estimate[_spread(len(estimate), detail)]
             label = "estimate, smoothed" if colored is None else "estimate, not compared"
             axes.plot(thin[:, 0], thin[:, 1], color=BLUE, linewidth=1.2, label=label)
         if colored is not None:
-            _paint_colored(figure, axes, estimate, colored)
+            _paint_colored(figure, axes, estimate, colored, detail)
         axes.plot(*estimate[0, :2], "o", color=BLACK, markersize=4.5, markerfacecolor="white", label="start", zorder=4)
         axes.plot(*estimate[-1, :2], "s", color=BLACK, markersize=4, label="end", zorder=4)
         axes.set_xlabel("x (m)")
@@ -134,7 +136,14 @@ def plan_view(
 
 
 def long_section(
-    key: str, *, along_m: F64, smoothed_z: F64, reference_z: F64 | None, bands: list[Band], x_label: str
+    key: str,
+    *,
+    along_m: F64,
+    smoothed_z: F64,
+    reference_z: F64 | None,
+    bands: list[Band],
+    x_label: str,
+    detail: float = 1.0,
 ) -> str:
     """SVG of the height along the way.
 
@@ -145,14 +154,15 @@ def long_section(
         reference_z: (n,) reference height.
         bands: stretches to shade.
         x_label: of the horizontal axis.
+        detail: as of `density`.
     """
 
     def paint(figure: Figure) -> None:
         axes = figure.add_subplot()
         shade(axes, bands)
-        pick = keep_peaks(along_m, smoothed_z)
+        pick = keep_peaks(along_m, smoothed_z, columns=round(COLUMNS * detail))
         if reference_z is not None:
-            chosen = keep_peaks(along_m, reference_z)
+            chosen = keep_peaks(along_m, reference_z, columns=round(COLUMNS * detail))
             axes.plot(along_m[chosen], reference_z[chosen], color=BLACK, linewidth=2.2, alpha=0.35, label="reference")
         axes.plot(along_m[pick], smoothed_z[pick], color=BLUE, linewidth=1.0, label="estimate, smoothed")
         axes.set_xlabel(x_label)
@@ -179,8 +189,8 @@ def _bounds(background: Density | None, reference: F64 | None, estimate: F64) ->
     return x0 - dx, x1 + dx, y0 - dy, y1 + dy
 
 
-def _spread(n: int) -> Any:
-    return np.unique(np.linspace(0, n - 1, min(n, _MAX_VERTICES)).astype(int))
+def _spread(n: int, detail: float) -> I64:
+    return np.unique(np.linspace(0, n - 1, min(n, round(_MAX_VERTICES * detail))).astype(np.int64))
 
 
 def _paint_density(axes: Axes, density: Density) -> None:
@@ -193,28 +203,36 @@ def _paint_density(axes: Axes, density: Density) -> None:
     axes.imshow(rgba, extent=density.extent_m, origin="lower", interpolation="none", aspect="equal", zorder=0.5)
 
 
-def _paint_colored(figure: Figure, axes: Axes, estimate: F64, colored: Colored) -> None:
+def _paint_colored(figure: Figure, axes: Axes, estimate: F64, colored: Colored, detail: float) -> None:
     along = estimate[colored.where, :2]
     step = np.linalg.norm(np.diff(along, axis=0, prepend=along[:1]), axis=1)
-    pick = keep_peaks(np.cumsum(step), colored.value, columns=_MAX_VERTICES)
+    pick = keep_peaks(np.cumsum(step), colored.value, columns=round(_MAX_VERTICES / 2 * detail))
     xy, value = along[pick], colored.value[pick]
     skipped = (colored.where - np.arange(len(colored.where)))[pick]
-    joined = np.diff(skipped) == 0
-    lines = LineCollection(
-        list(np.stack([xy[:-1], xy[1:]], axis=1)[joined]),
-        cmap=error_colors(),
-        linewidth=2.2,
-        capstyle="round",
-        zorder=2.5,
-    )
-    lines.set_array(np.maximum(value[:-1], value[1:])[joined])
-    lines.set_clim(0.0, max(float(colored.value.max()), 1e-3))
-    # thousands of short coloured pieces are smaller, and drawn faster, as a picture
-    lines.set_rasterized(True)
-    axes.add_collection(lines)
-    bar = figure.colorbar(lines, cax=axes.inset_axes((1.02, 0.0, 0.025, 1.0)))
+    top = max(float(colored.value.max()), 1e-3)
+    colors = error_colors(_LEVELS)
+    level = np.minimum(np.maximum(value[:-1], value[1:]) / top * _LEVELS, _LEVELS - 1).astype(int)
+    level[np.diff(skipped) > 0] = -1
+    # one path a colour, the worst on top: few elements, and crisp in print
+    for k in range(_LEVELS):
+        pieces = _pieces(xy, level == k)
+        if len(pieces):
+            line = PathPatch(pieces, fill=False, edgecolor=colors(k), linewidth=2.2, capstyle="round", zorder=2.5)
+            axes.add_patch(line)
+    scale = ScalarMappable(Normalize(0.0, top), colors)
+    bar = figure.colorbar(scale, cax=axes.inset_axes((1.02, 0.0, 0.025, 1.0)))
     bar.set_label(colored.label)
     bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+
+
+def _pieces(xy: F64, chosen: Bool) -> Path:
+    """The chosen segments of a polyline (n, 2), neighbours joined, as one path."""
+    first = np.flatnonzero(chosen & ~np.concatenate([[False], chosen[:-1]]))
+    last = np.flatnonzero(chosen & ~np.concatenate([chosen[1:], [False]])) + 1
+    runs = [xy[a : b + 1] for a, b in zip(first, last, strict=True)]
+    codes = [np.array([Path.MOVETO, *[Path.LINETO] * (len(run) - 1)], dtype=np.uint8) for run in runs]
+    empty = np.zeros((0, 2)), np.zeros(0, np.uint8)
+    return Path(np.concatenate([empty[0], *runs]), np.concatenate([empty[1], *codes]))
 
 
 def _paint_scale(axes: Axes, width_m: float) -> None:

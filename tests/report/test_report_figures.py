@@ -68,7 +68,7 @@ def test_metres_flown_are_held_at_the_ends():
 
 
 def test_large_errors_are_dark():
-    luminance = error_colors()(np.linspace(0, 1, 20))[:, :3] @ [0.2126, 0.7152, 0.0722]
+    luminance = error_colors(20)(np.linspace(0, 1, 20))[:, :3] @ [0.2126, 0.7152, 0.0722]
     assert (np.diff(luminance) < 0).all()
     assert luminance[0] < 0.8
 
