@@ -83,6 +83,7 @@ class CloudTranscoder:
         self._xyz = _place(layout)
         self._times = times
         self._scratch = np.empty(0)
+        self._returns = _Returns()
         self.period_ns = period_ns
         self._time = self._time_column(layout, told)
         ring = layout.ring if rings.source == "field" else None
@@ -116,7 +117,7 @@ class CloudTranscoder:
             or cloud.fields != self._fields
         ):
             return None
-        if not _all_returns(data, self._xyz, n, self._step):
+        if not self._returns.are_all(data, self._xyz, n, self._step):
             return None
         header_ns = int(cloud.header.stamp.sec) * 1_000_000_000 + int(cloud.header.stamp.nanosec)
         timed = self._stamp_and_offsets(data, n, header_ns)
@@ -184,47 +185,64 @@ def learn(decoder: SweepDecoder, told: LidarRules, message: object) -> CloudTran
         return None
 
 
-def view_canonical(data: bytes | memoryview, message: object) -> CanonicalCloud | None:
-    """A message of a canonical flight as it stands; None if it is none, or holds what such a flight does not.
+class _Returns:
+    """Looks for points that are no returns, in memory that is used again: fresh memory costs more than the looking."""
 
-    Args:
-        data: serialised.
-        message: the same, decoded.
-    """
-    cloud = cast("Any", message)
-    n, step, points = int(cloud.width), int(cloud.point_step), cast("U8", cloud.data)
-    if not n or cloud.height != 1 or cloud.is_bigendian or not cloud.is_dense or cloud.header.frame_id != "lidar":
-        return None
-    at = 0
-    for field in cloud.fields:
-        if (str(field.name), int(field.datatype)) not in _CANONICAL or int(field.offset) != at or field.count != 1:
+    def __init__(self) -> None:
+        self._scratch = np.empty(0, np.uint8)
+
+    def are_all(self, data: U8, place: _Place, n: int, step: int) -> bool:
+        """Whether all points are finite and none is at the origin."""
+        width = np.dtype(place.form).itemsize
+        if len(self._scratch) < n * width:
+            self._scratch = np.empty(2 * n * width, np.uint8)
+        # in one piece; numpy copies 16 bytes five times as fast as 12
+        piece = self._scratch[: n * width]
+        piece.view(place.form)[...] = strided(data, place.form, place.offset, n, step)
+        flat = piece.view("<f4")
+        if not (np.isfinite(np.maximum.reduce(flat)) and np.isfinite(np.minimum.reduce(flat))):
+            return False
+        points = flat.reshape(n, -1)[:, :3]
+        return not bool((points[np.flatnonzero(points[:, 0] == 0)] == 0).all(axis=1).any())
+
+
+class CanonicalView:
+    """Recognises the clouds of a canonical flight, which pass as they stand."""
+
+    def __init__(self) -> None:
+        self._returns = _Returns()
+
+    def __call__(self, data: bytes | memoryview, message: object) -> CanonicalCloud | None:
+        """What is in the message; None if it is none of a canonical flight, or holds what such a flight does not.
+
+        Args:
+            data: serialised.
+            message: the same, decoded.
+        """
+        cloud = cast("Any", message)
+        n, step, points = int(cloud.width), int(cloud.point_step), cast("U8", cloud.data)
+        if not n or cloud.height != 1 or cloud.is_bigendian or not cloud.is_dense or cloud.header.frame_id != "lidar":
             return None
-        at += _CANONICAL[str(field.name), int(field.datatype)]
-    names = [str(field.name) for field in cloud.fields]
-    place = _Place(0, "V16" if "intensity" in names else "V12")
-    if (
-        names[:3] != ["x", "y", "z"]
-        or at != step
-        or len(points) != n * step
-        or not _all_returns(points, place, n, step)
-    ):
-        return None
-    stamp_ns = end_ns = int(cloud.header.stamp.sec) * 1_000_000_000 + int(cloud.header.stamp.nanosec)
-    if names[-1] == "t":
-        form = "<u4" if cloud.fields[-1].datatype == 6 else "<f8"
-        end_ns += int(strided(points, form, step - int(form[2]), n, step).max())
-    xyz = np.ndarray((n, 3), "<f4", points, 0, (step, 4))
-    return CanonicalCloud(memoryview(data), stamp_ns, end_ns, stamp_ns, xyz, frozenset(names))
-
-
-def _all_returns(data: U8, place: _Place, n: int, step: int) -> bool:
-    """Whether all points are finite and none is at the origin."""
-    # numpy copies 16 bytes five times as fast as 12; a sum is finite only if all terms are
-    flat = strided(data, place.form, place.offset, n, step).copy().view("<f4")
-    if not np.isfinite(np.add.reduce(flat)):
-        return False
-    points = flat.reshape(n, -1)[:, :3]
-    return not bool((points[np.flatnonzero(points[:, 0] == 0)] == 0).all(axis=1).any())
+        at = 0
+        for field in cloud.fields:
+            if (str(field.name), int(field.datatype)) not in _CANONICAL or int(field.offset) != at or field.count != 1:
+                return None
+            at += _CANONICAL[str(field.name), int(field.datatype)]
+        names = [str(field.name) for field in cloud.fields]
+        place = _Place(0, "V16" if "intensity" in names else "V12")
+        if (
+            names[:3] != ["x", "y", "z"]
+            or at != step
+            or len(points) != n * step
+            or not self._returns.are_all(points, place, n, step)
+        ):
+            return None
+        stamp_ns = end_ns = int(cloud.header.stamp.sec) * 1_000_000_000 + int(cloud.header.stamp.nanosec)
+        if names[-1] == "t":
+            form = "<u4" if cloud.fields[-1].datatype == 6 else "<f8"
+            end_ns += int(strided(points, form, step - int(form[2]), n, step).max())
+        xyz = np.ndarray((n, 3), "<f4", points, 0, (step, 4))
+        return CanonicalCloud(memoryview(data), stamp_ns, end_ns, stamp_ns, xyz, frozenset(names))
 
 
 def _patch(out: U8, start: int, stamp_ns: int, n: int, step: int) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from mineloc.data import F32, Sweep, Trajectory
 from mineloc.errors import IngestError
-from mineloc.io.cloud_transcoder import CanonicalCloud, CloudTranscoder, learn, view_canonical
+from mineloc.io.cloud_transcoder import CanonicalCloud, CanonicalView, CloudTranscoder, learn
 from mineloc.io.findings import Finding
 from mineloc.io.flight_layout import PERIOD_KEY
 from mineloc.io.flight_writer import FlightWriter
@@ -98,6 +98,7 @@ class LidarIntake:
         self._decoder = decoder
         self._told = told
         self._transcoder: CloudTranscoder | None = None
+        self._canonical = CanonicalView()
         self._may_learn = True
         self._motion = motion
         self._writer = writer
@@ -150,7 +151,7 @@ class LidarIntake:
     def _pass_on(self, raw: RawMessage, message: object) -> bool:
         """Write a sweep of a canonical flight as it stands; False if it is none."""
         period = raw.notes.get(PERIOD_KEY, "")
-        cloud = view_canonical(raw.data, message) if period.isdigit() and self._told == LidarRules() else None
+        cloud = self._canonical(raw.data, message) if period.isdigit() and self._told == LidarRules() else None
         if cloud is None:
             return False
         self._write_raw(cloud, int(period), raw.log_ns, raw.publish_ns)

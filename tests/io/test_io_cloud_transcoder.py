@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mineloc.io import canonical
-from mineloc.io.cloud_transcoder import CloudTranscoder, learn, view_canonical
+from mineloc.io.cloud_transcoder import CanonicalView, CloudTranscoder, learn
 from mineloc.io.ros import POINT_CLOUD2, STORE
 from mineloc.io.sequence import LidarRules
 from mineloc.io.sweep_decoder import LEARNED_FROM, SweepDecoder
@@ -135,7 +135,7 @@ def test_any_times_give_the_same_bytes(seed: int, late_ns: int, unit: str) -> No
 def test_canonical_clouds_are_recognised(drop) -> None:
     sweep = replace(SWEEPS[0], **dict.fromkeys(drop))
     data = canonical.encode_sweep(sweep)
-    cloud = view_canonical(data, STORE.deserialize_cdr(data, POINT_CLOUD2))
+    cloud = CanonicalView()(data, STORE.deserialize_cdr(data, POINT_CLOUD2))
     assert cloud is not None
     assert (cloud.stamp_ns, cloud.end_ns) == (sweep.stamp_ns, sweep.end_ns)
     assert bytes(cloud.data) == bytes(data)
@@ -145,8 +145,8 @@ def test_canonical_clouds_are_recognised(drop) -> None:
 def test_clouds_that_are_not_canonical_are_not_taken_for_it() -> None:
     data = canonical.encode_sweep(SWEEPS[0])
     message = STORE.deserialize_cdr(data, POINT_CLOUD2)
-    assert view_canonical(data, _at_start(SWEEPS[0])) is None
-    assert view_canonical(data, _with(message, "y", 2, np.nan)) is None
-    assert view_canonical(data, replace(message, is_dense=False)) is None
-    assert view_canonical(data, replace(message, width=3)) is None
-    assert view_canonical(data, replace(message, header=replace(message.header, frame_id="velodyne"))) is None
+    assert CanonicalView()(data, _at_start(SWEEPS[0])) is None
+    assert CanonicalView()(data, _with(message, "y", 2, np.nan)) is None
+    assert CanonicalView()(data, replace(message, is_dense=False)) is None
+    assert CanonicalView()(data, replace(message, width=3)) is None
+    assert CanonicalView()(data, replace(message, header=replace(message.header, frame_id="velodyne"))) is None
