@@ -10,6 +10,7 @@ from __future__ import annotations
 import ast
 import re
 import sys
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
@@ -20,6 +21,7 @@ from mineloc.store.digest import canonical_json, sha256_of_file, sha256_of_text
 
 # Libraries that are not installed under the name by which they are imported; others are looked up, slowly.
 _DISTRIBUTIONS = {"rerun": "rerun-sdk"}
+_PARSING = threading.Lock()
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +165,13 @@ def source_tree() -> SourceTree:
     return SourceTree("mineloc", Path(__file__).parent.parent)
 
 
-@lru_cache
 def code_digest(module: str) -> str:
     """The digest of a mineloc module's closure; constant while the process lives, as its code is."""
+    # Parsing in two threads at once is an internal error of Python before 3.11.5 (SystemError, cpython 106905).
+    with _PARSING:
+        return _code_digest(module)
+
+
+@lru_cache
+def _code_digest(module: str) -> str:
     return source_tree().digest(module)
