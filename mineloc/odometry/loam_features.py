@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from mineloc.compiled import njit
 from mineloc.config import LoamConfig
 from mineloc.data import F32, F64, I64, Sweep
 from mineloc.sweep import deskew_constant_twist

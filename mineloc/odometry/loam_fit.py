@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from mineloc.compiled import njit
 from mineloc.data import F64
 
 NO_FIT, FITS, FIRM = 0, 1, 2

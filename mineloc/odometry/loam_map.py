@@ -11,10 +11,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from mineloc import se3
+from mineloc.compiled import njit
 from mineloc.data import F32, F64, I64
 from mineloc.odometry.loam_fit import FIRM, NO_FIT, fit_line, fit_plane
 from mineloc.odometry.loam_solver import Matches

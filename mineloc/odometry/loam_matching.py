@@ -8,10 +8,10 @@ a third one of another ring.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from mineloc import se3
+from mineloc.compiled import njit
 from mineloc.data import F32, F64, I64, Sweep
 from mineloc.odometry.loam_features import ring_starts
 from mineloc.odometry.loam_solver import Matches

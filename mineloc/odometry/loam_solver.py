@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from mineloc import se3
+from mineloc.compiled import njit
 from mineloc.data import F64
 
 Bool = NDArray[np.bool_]
