@@ -30,6 +30,8 @@ Bool = NDArray[np.bool_]
 
 START_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
 TRUTH_NS = 10_000_000
+# inertial samples and truth go on a little after the last sweep: its last point lies between two of them
+AFTER_NS = 20_000_000
 
 # what a random stream is for
 _TOUR, _SWAY, _VIBRATION, _IMU, _RANGES, _LOSS = range(1, 7)
@@ -123,11 +125,13 @@ class SimulatedFlight:
         lost = missing(self.sweeps, config.sweep_loss, _rng(config.seed, _LOSS))
         period_ns = round(1e9 / config.lidar_hz)
         for revolution in range(self.sweeps):
-            first, last = (-(-(revolution + k) * period_ns // TRUTH_NS) for k in range(2))
-            stamps = START_NS + np.arange(first, last, dtype=np.int64) * TRUTH_NS
+            begin_ns, end_ns = revolution * period_ns, (revolution + 1) * period_ns
+            if revolution == self.sweeps - 1:
+                end_ns += AFTER_NS
+            stamps = START_NS + np.arange(-(-begin_ns // TRUTH_NS), -(-end_ns // TRUTH_NS), dtype=np.int64) * TRUTH_NS
             yield Packet(
                 None if lost[revolution] else self.sweep(revolution),
-                imu.until(START_NS + (revolution + 1) * period_ns),
+                imu.until(START_NS + end_ns),
                 Trajectory(stamps, self.pose(stamps)),
             )
 

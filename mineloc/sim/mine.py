@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from mineloc.errors import SimulationError
 from mineloc.sim.builtin import BUILTIN
-from mineloc.sim.dxf import read_dxf
 from mineloc.sim.from_mesh import roadways_of_mesh
 from mineloc.sim.mesh_file import SUFFIXES, read_mesh
 from mineloc.sim.plan import MinePlan, plan_graph, read_plan
@@ -68,6 +67,9 @@ def load_mine(
     if suffix == ".toml":
         return planned_mine(read_plan(path), threads=threads)
     if suffix == ".dxf":
+        # ezdxf takes as long to load as all the rest
+        from mineloc.sim.dxf import read_dxf
+
         return planned_mine(read_dxf(path, width_m=roadway_width_m, height_m=roadway_height_m), threads=threads)
     if suffix not in SUFFIXES:
         raise SimulationError(

@@ -1,4 +1,15 @@
-"""Mine plans: centre-lines with widths and heights, from TOML or from code, and the roadway graph that they make."""
+"""Mine plans: centre-lines with widths and heights, from TOML or from code, and the roadway graph that they make.
+
+name = "north panel"
+[roughness]
+wall_m = 0.08                                       # standard deviation of the walls
+[[roadway]]
+points_m = [[0, 0, 0], [60, 0, 0.5], [90, 20, 1]]   # on the floor
+width_m = 4.5
+height_m = 3.5
+[[roadway]]
+points_m = [[60, 0, 0.5], [60, 40, 0.5]]            # begins on the other: an intersection
+"""
 
 from __future__ import annotations
 

@@ -215,16 +215,10 @@ def _measure(
     intensity = np.zeros(n, np.float32)
     for i in range(n):
         r = float(true_range[i])
-        reflectivity, spread = 0.1, sigma
-        cosine = 1.0
+        reflectivity, cosine, spread = 0.1, 1.0, sigma
         if np.isfinite(r):
-            x = rays[i, 0] + r * rays[i, 3]
-            y = rays[i, 1] + r * rays[i, 4]
-            z = rays[i, 2] + r * rays[i, 5]
-            reflectivity = _reflectivity(x, y, z)
-            dot = rays[i, 3] * normals[i, 0] + rays[i, 4] * normals[i, 1] + rays[i, 5] * normals[i, 2]
-            cosine = max(abs(dot), 1e-3)
-            tangent = min(np.sqrt(max(1.0 - cosine * cosine, 0.0)) / cosine, 6.0)
+            reflectivity, cosine = _surface(rays[i], r, normals[i])
+            tangent = min(np.sqrt(1.0 - cosine * cosine) / cosine, 6.0)
             spread = np.sqrt(sigma * sigma + (grazing * r * tangent) ** 2)
         if chance[0, i] < dust:
             # dust thins out with distance; the wall wins where it is nearer
@@ -244,6 +238,14 @@ def _measure(
             ranges[i] = r
             intensity[i] = np.rint(min(max(255.0 * reflectivity * cosine**0.5, 0.0), 255.0))
     return seen, ranges, intensity
+
+
+@njit(cache=True, nogil=True)
+def _surface(ray: F32, r: float, normal: F32) -> tuple[float, float]:
+    """Reflectivity and cosine of the incidence angle where a ray meets a surface after `r` metres."""
+    reflectivity = _reflectivity(ray[0] + r * ray[3], ray[1] + r * ray[4], ray[2] + r * ray[5])
+    cosine = abs(ray[3] * normal[0] + ray[4] * normal[1] + ray[5] * normal[2])
+    return reflectivity, min(max(float(cosine), 1e-3), 1.0)
 
 
 def points_of(shots: Shots, index: I64, range_m: F64) -> F32:

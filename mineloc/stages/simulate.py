@@ -77,6 +77,22 @@ def simulate(
         roadway_height_m=settings.roadway_height_m,
     )
     flight = SimulatedFlight(site, settings, start=start)
+    sweeps, points, path_m = _write(flight, out, progress)
+    return SimulateResult(
+        out=out,
+        sweeps=sweeps,
+        points=points,
+        path_m=path_m,
+        duration_s=flight.sweeps / settings.lidar_hz,
+        roadways_m=site.graph.length_m,
+        intersections=len(site.graph.intersections),
+        roadways_seen=len({step.roadway for step in flight.tour}),
+        roadways=len(flight.graph.roadways),
+    )
+
+
+def _write(flight: SimulatedFlight, out: Path, progress: Progress) -> tuple[int, int, float]:
+    """Sweeps and points written, and the length of the true path."""
     sweeps = points = 0
     path_m, last_m = 0.0, flight.motion.pose(np.zeros(1))[0, :3, 3]
     with FlightWriter(out, flight.info, flight.calibration) as writer:
@@ -91,14 +107,4 @@ def simulate(
             path_m += float(np.linalg.norm(np.diff(line_m, axis=0), axis=1).sum())
             last_m = line_m[-1]
             progress(done, flight.sweeps, "sweeps")
-    return SimulateResult(
-        out=out,
-        sweeps=sweeps,
-        points=points,
-        path_m=path_m,
-        duration_s=flight.sweeps / settings.lidar_hz,
-        roadways_m=site.graph.length_m,
-        intersections=len(site.graph.intersections),
-        roadways_seen=len({step.roadway for step in flight.tour}),
-        roadways=len(flight.graph.roadways),
-    )
+    return sweeps, points, path_m

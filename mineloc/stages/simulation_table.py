@@ -14,7 +14,7 @@ def simulation_table(result: SimulateResult) -> Table:
     table.add_column()
     table.add_column(overflow="fold")
     table.add_row("flight", str(result.out))
-    table.add_row("mine", f"{result.roadways_m:,.0f} m of roadway, {result.intersections} intersections")
+    table.add_row("mine", f"{result.roadways_m:,.0f} m of roadway, intersections: {result.intersections}")
     table.add_row("path", f"{result.path_m:,.1f} m in {result.duration_s:,.0f} s")
     table.add_row("roadways flown", f"{result.roadways_seen} of {result.roadways}")
     table.add_row("sweeps", f"{result.sweeps:,} with {result.points / max(result.sweeps, 1):,.0f} points each")

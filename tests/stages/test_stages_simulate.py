@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from mineloc import cli
@@ -15,6 +17,7 @@ from mineloc.errors import OutputError, SimulationError
 from mineloc.io.flight import FlightReader
 from mineloc.sim.flight import SimulatedFlight
 from mineloc.sim.mine import load_mine
+from mineloc.stages.progress_bar import progress_bar
 from mineloc.stages.simulate import simulate
 
 PLAN = """
@@ -65,8 +68,10 @@ def test_flight_file_holds_what_was_flown(plan: Path, written: Path) -> None:
     np.testing.assert_array_equal(imu.gyro_radps, np.concatenate([packet.imu.gyro_radps for packet in packets]))
     assert reference is not None
     np.testing.assert_allclose(reference.poses, flight.pose(reference.stamps_ns), atol=1e-9)
-    # every sweep lies within the truth
-    assert reference.stamps_ns[0] <= sweeps[0].stamp_ns
+    # every sweep lies within the truth and the inertial samples
+    for stamps in (reference.stamps_ns, imu.stamps_ns):
+        assert stamps[0] <= sweeps[0].stamp_ns
+        assert stamps[-1] >= sweeps[-1].end_ns
 
 
 def test_same_bytes_twice_and_progress_to_the_end(plan: Path, written: Path, tmp_path: Path) -> None:
@@ -102,6 +107,16 @@ def test_failures_leave_nothing_and_existing_files_alone(plan: Path, written: Pa
     assert list(tmp_path.iterdir()) == []
 
 
+def test_bar_shows_rate_and_end_on_a_terminal_and_nothing_elsewhere() -> None:
+    for terminal in (True, False):
+        screen = io.StringIO()
+        with progress_bar("simulate", console=Console(file=screen, force_terminal=terminal, width=100)) as progress:
+            progress(0, None, "sweeps")
+            progress(30, 60, "sweeps")
+            progress(60, 60, "sweeps")
+        assert ("simulate" in screen.getvalue() and "100%" in screen.getvalue()) == terminal
+
+
 def test_command_flies_prints_and_refuses(plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     runner = CliRunner()
     out = tmp_path / "f.mcap"
@@ -116,6 +131,10 @@ def test_command_flies_prints_and_refuses(plan: Path, tmp_path: Path, monkeypatc
         assert reader.sweep_count == told["sweeps"]
     with pytest.raises(OutputError):
         runner.invoke(cli.app, common, catch_exceptions=False)
+    shown = runner.invoke(cli.app, [*common[:2], "--out", str(tmp_path / "h.mcap"), "--set", "simulate.length_m=4"])
+    assert shown.exit_code == 0, shown.output
+    assert "intersections: 1" in shown.stdout
+    (tmp_path / "h.mcap").unlink()
     monkeypatch.setattr("sys.argv", ["mineloc", "simulate", "nowhere", "--out", str(tmp_path / "g.mcap")])
     with pytest.raises(SystemExit) as stop:
         cli.main()
