@@ -9,8 +9,9 @@ import numpy as np
 
 from mineloc.data import F64
 from mineloc.report.along import Band, Curve, curves
+from mineloc.report.density import density
 from mineloc.report.facts import RunFacts
-from mineloc.report.plan import Colored, density, long_section, plan_view
+from mineloc.report.plan import Colored, long_section, plan_view
 from mineloc.stages.comparison import frame_of
 
 _FLOWN = "distance flown (m)"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,61 +14,12 @@ from matplotlib.path import Path
 
 from mineloc.data import F64, I64, Bool
 from mineloc.report.along import Band, shade
+from mineloc.report.density import Density
 from mineloc.report.svg import BLACK, BLUE, COLUMNS, WIDTH_IN, draw, error_colors, keep_peaks
-from mineloc.stages.run_folder import RunFolder
 
-_PIXELS = 1000  # longer side of the raster of points
-_MIN_PIXEL_M = 0.1
-_CHUNK = 1 << 18
 _MAX_VERTICES = 2000
 _LEVELS = 16
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Density:
-    """How many points lie over each cell of the plan.
-
-    Attributes:
-        counts: (rows, columns), row 0 at the smallest y.
-        extent_m: x from, x to, y from, y to.
-    """
-
-    counts: F64
-    extent_m: tuple[float, float, float, float]
-
-
-def density(run: RunFolder, T_frame_map: F64, *, detail: float = 1.0) -> Density | None:
-    """The keyframe points, placed by the smoothed poses and seen from above; None without points.
-
-    Args:
-        run: its points are placed in portions: a big map needs little memory.
-        T_frame_map: (4, 4) from the run's map to the frame of the figure.
-        detail: 1 for a page with one run, less for many.
-    """
-    table = run.points()
-    if table.is_empty():
-        return None
-    poses = T_frame_map @ run.keyframe_poses
-    rows_of = np.searchsorted(run.keyframes["index"].to_numpy(), table["keyframe"].to_numpy())
-    points = table.select("x_m", "y_m", "z_m").to_numpy()
-    chunks = [slice(at, at + _CHUNK) for at in range(0, len(points), _CHUNK)]
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    for part in chunks:
-        xy = _plan_xy(poses, rows_of[part], points[part])
-        low, high = np.minimum(low, xy.min(axis=0)), np.maximum(high, xy.max(axis=0))
-    pixel_m = max(float((high - low).max()) / (_PIXELS * detail), _MIN_PIXEL_M)
-    columns, rows = (np.ceil((high - low) / pixel_m).astype(int) + 1).tolist()
-    counts = np.zeros(rows * columns)
-    for part in chunks:
-        cell = ((_plan_xy(poses, rows_of[part], points[part]) - low) / pixel_m).astype(np.int64)
-        counts += np.bincount(cell[:, 1] * columns + cell[:, 0], minlength=rows * columns)
-    extent = (low[0], low[0] + columns * pixel_m, low[1], low[1] + rows * pixel_m)
-    return Density(counts.reshape(rows, columns), extent)
-
-
-def _plan_xy(poses: F64, rows_of: Any, points: Any) -> F64:
-    pose = poses[rows_of, :2]
-    return np.einsum("nij,nj->ni", pose[:, :, :3], points.astype(np.float64)) + pose[:, :, 3]
+_NEARLY_ALL = 0.99
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,7 +69,7 @@ def plan_view(
         if reference is not None:
             thin = reference[_spread(len(reference), detail)]
             axes.plot(thin[:, 0], thin[:, 1], color=BLACK, linewidth=0.5, label="reference")
-        if colored is None or len(colored.where) < len(estimate):
+        if colored is None or len(colored.where) < _NEARLY_ALL * len(estimate):
             thin = estimate[_spread(len(estimate), detail)]
             label = "estimate, smoothed" if colored is None else "estimate, not compared"
             axes.plot(thin[:, 0], thin[:, 1], color=BLUE, linewidth=1.2, label=label)

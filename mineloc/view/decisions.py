@@ -16,11 +16,11 @@ HELD, DEGENERATE, UNTRUSTED = "held on all sides", "degenerate", "motion prior a
 
 
 def run_decisions(run: RunFolder, smoothed: Trajectory) -> list[Line]:
-    """(time, level, text) of every stretch that was untrusted or degenerate and of every recognition, by time."""
+    """(time, level, text) of begin and end, untrusted and degenerate stretches and recognitions, by time."""
     lines = [_untrusted(stretch) for stretch in untrusted_stretches(run.sweeps)]
     lines += [_degenerate(stretch, smoothed) for stretch in degenerate_stretches(run.sweeps)]
     lines += [_recognition(row) for row in run.fixes.iter_rows(named=True)]
-    return sorted(lines)
+    return [_begin(run, smoothed), *sorted(lines), _end(smoothed)]
 
 
 def run_states(sweeps: pl.DataFrame) -> dict[int, str]:
@@ -30,6 +30,15 @@ def run_states(sweeps: pl.DataFrame) -> dict[int, str]:
     table = sweeps.select("stamp_ns", state=state)
     changed = table.filter(pl.col("state").ne_missing(pl.col("state").shift()))
     return dict(changed.iter_rows())
+
+
+def _begin(run: RunFolder, smoothed: Trajectory) -> Line:
+    return int(smoothed.stamps_ns[0]), "INFO", f"first pose; {len(run.sweeps)} sweeps, {len(run.keyframes)} keyframes"
+
+
+def _end(smoothed: Trajectory) -> Line:
+    seconds = int(smoothed.stamps_ns[-1] - smoothed.stamps_ns[0]) * 1e-9
+    return int(smoothed.stamps_ns[-1]), "INFO", f"last pose, {smoothed.path_m[-1]:.1f} m and {seconds:.1f} s on"
 
 
 def _seconds(stretch: Stretch) -> float:

@@ -9,8 +9,8 @@ from synthetic_run import SyntheticRun
 
 from mineloc import se3
 from mineloc.report.along import Band, Curve, Way, curves
+from mineloc.report.density import density
 from mineloc.report.numbers import Numbers, metres, share, three_digits
-from mineloc.report.plan import density
 from mineloc.report.svg import error_colors, keep_peaks
 from mineloc.stages.run_folder import RunFolder
 

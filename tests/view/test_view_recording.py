@@ -151,6 +151,8 @@ def test_decisions_tell_time_level_and_reason(recorded):
     assert any(text.startswith("degenerate for 16 m (10.8 s)") for text in texts)
     assert "keyframe 5: recognised J1 (overlap 0.9)" in texts
     assert "keyframe 25: refused, overlap 0.31 < 0.6" in texts
+    assert texts[0] == "first pose; 1500 sweeps, 215 keyframes"
+    assert texts[-1].startswith("last pose, 222.")
     states = [value[0] for value in recording.values["/states/registration", "StateChange:state"]]
     assert states[:4] == ["held on all sides", "degenerate", "motion prior alone", "degenerate"]
 
