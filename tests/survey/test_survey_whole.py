@@ -1,0 +1,65 @@
+"""Whole surveys with all stages: equal results wherever they are made, and the demonstration."""
+
+import hashlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+pytestmark = pytest.mark.slow
+
+SURVEY = """
+workers = 1
+methods = ["odometry", "loam"]
+[config.simulate]
+hover_s = 1.0
+length_m = 20.0
+[[flight]]
+name = "loop"
+mine = "loop"
+"""
+# what takes how long differs, the report tells it, and equal Rerun recordings differ in their ids
+TIMED = ("timing.json", "run.rrd", "report.html", "report.json")
+
+
+def mineloc(*args: str, cwd: Path, **environment: str) -> str:
+    command = [sys.executable, "-P", "-m", "mineloc.cli", *args]
+    ran = subprocess.run(command, cwd=cwd, env=os.environ | environment, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout
+
+
+def fingerprint(out: Path) -> dict[str, str]:
+    found: dict[str, str] = {}
+    for path in sorted(out.rglob("*")):
+        name = path.relative_to(out).as_posix()
+        if not path.is_file() or name.startswith(".mineloc") or path.name in TIMED:
+            continue
+        content = path.read_bytes()
+        if path.name == "sweeps.parquet":
+            content = pl.read_parquet(path).drop("step_ms").write_json().encode()
+        found[name] = hashlib.sha256(content).hexdigest()
+    return found
+
+
+def test_results_depend_on_nothing_but_the_survey(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b" / "deeper").mkdir(parents=True)
+    for folder, seed, threads in ((tmp_path / "a", "1", "1"), (tmp_path / "b" / "deeper", "2", "2")):
+        (folder / "s.toml").write_text(SURVEY)
+        mineloc("run", "s.toml", "--local", cwd=folder, PYTHONHASHSEED=seed, OMP_NUM_THREADS=threads)
+    one, two = fingerprint(tmp_path / "a" / "s.results"), fingerprint(tmp_path / "b" / "deeper" / "s.results")
+    assert len(one) > 10
+    assert one == two
+
+
+def test_the_demonstration_executes_everything_once(tmp_path):
+    first = mineloc("demo", "--local", cwd=tmp_path)
+    steps = first.count("✓")
+    assert steps == 11
+    assert (tmp_path / "demo" / "report" / "report.html").exists()
+    second = mineloc("demo", "--local", cwd=tmp_path)
+    assert (second.count("✓"), second.count(" known")) == (0, steps)
