@@ -39,7 +39,7 @@ _INFO = frozenset(
     | {"azimuth_times"}
 )
 # The topic monitors tell these with more detail.
-_TOLD_BY_MONITOR = frozenset({"imu_time_not_increasing", "pose_time_not_increasing", "imu_not_finite"})
+_TOLD_BY_MONITOR = frozenset({"imu_time_not_increasing", "pose_time_not_increasing"})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,6 +77,7 @@ def plan_flight(recording: Recording, told: Sequence) -> Plan:
     calibration, earlier = told.calibration, None
     if facts is not None:
         own, calibration, earlier = facts
+        remarks = []  # the topics of a flight are what they are called
         info = _override(own, info)
     if "T_body" in told.model_fields_set:
         calibration = told.calibration

@@ -25,7 +25,6 @@ class ImuMonitor:
 
     def __init__(self) -> None:
         self.samples = 0
-        self.not_finite = 0
         self._accel_mps2 = Sampler()
         self._gyro_radps = Sampler()
 
@@ -43,13 +42,7 @@ class ImuMonitor:
 
     def findings(self, topic: str) -> list[HealthFinding]:
         """Unit mistakes and dead sensors."""
-        found: list[HealthFinding] = []
-        if self.not_finite:
-            detail = f"{self.not_finite} samples on {topic} are not finite and were left out"
-            found.append(HealthFinding("imu_not_finite", "warning", self.not_finite, detail))
-        if self.samples >= _FEW:
-            found += self._accel_findings(topic) + self._gyro_findings(topic)
-        return found
+        return self._accel_findings(topic) + self._gyro_findings(topic) if self.samples >= _FEW else []
 
     def _accel_findings(self, topic: str) -> list[HealthFinding]:
         median = self._accel_mps2.median
