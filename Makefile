@@ -31,7 +31,7 @@ lint: .stamps/dev
 	$(BIN)/lint-imports
 
 bench: .stamps/dev
-	$(BIN)/python benchmarks/ingest_speed.py
+	$(MAKE) -C benchmarks PYTHON=$(abspath $(BIN))/python
 
 # Fresh pins; those that still fit stay as they are.
 constraints: .stamps/venv

@@ -36,9 +36,8 @@ def main() -> int:
     except KeyboardInterrupt:
         return 130
     except Exception as error:  # noqa: BLE001  # the user gets one line, the log the rest
-        log = given.out / ".mineloc" / "logs" / "flow.log"
-        what = f"the program failed ({error!r})"
-        return _fail(given.events, SurveyError("flow", what, todo=f"the whole story is in {log}"))
+        todo = f"the whole story is in {given.out / '.mineloc/logs/flow.log'}"
+        return _fail(given.events, SurveyError("flow", f"the program failed ({error!r})", todo=todo))
     return 0
 
 
@@ -67,10 +66,7 @@ def _flow(given: argparse.Namespace) -> None:
 
 def _fail(events: int | None, error: MinelocError) -> int:
     traceback.print_exc()
-    if events is None:
-        sys.stderr.write(f"{error}\n")
-    else:
-        os.write(events, error_to_line(error).encode())
+    os.write(2 if events is None else events, error_to_line(error).encode())
     return 1
 
 
