@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -88,7 +89,7 @@ def test_portions_do_not_matter_to_a_monitor(seed: int, count: int, cuts: list[i
     whole, parts, single = (TopicMonitor("lidar", TOPIC) for _ in range(3))
     kept = whole.take(stamps, logs, headers_ns=headers)
     borders = [0, *sorted(min(cut, count) for cut in cuts), count]
-    pieces = [slice(a, b) for a, b in zip(borders[:-1], borders[1:], strict=True)]
+    pieces = [slice(a, b) for a, b in pairwise(borders)]
     in_parts = [parts.take(stamps[p], logs[p], headers_ns=headers[p]) for p in pieces]
     one_by_one = [single.take_one(*map(int, row)) for row in zip(stamps, logs, headers, strict=True)]
     np.testing.assert_array_equal(kept, np.concatenate(in_parts))
@@ -138,12 +139,6 @@ def test_usual_inertial_samples_and_too_few_to_tell_are_not_named() -> None:
     assert felt(9.81, 0.4) == {}
     assert felt(8.2, 1.5) == {}
     assert felt(1.0, 30.0, count=10) == {}
-
-
-def test_samples_that_are_not_finite_are_told() -> None:
-    monitor = ImuMonitor()
-    monitor.not_finite = 3
-    assert [finding.name for finding in monitor.findings("/imu")] == ["imu_not_finite"]
 
 
 # --- motion --------------------------------------------------------------------------------------------------------
@@ -286,15 +281,14 @@ def test_damage_tells_its_place_and_its_price(damage: Damage, says: str) -> None
     assert damage.describe() == says
 
 
+SEVERITIES = (("a", "info"), ("b", "error"), ("c", "warning"))
+
+
 def health(*damage: Damage, earlier: dict[str, object] | None = None) -> Health:
     monitor = TopicMonitor("lidar", TOPIC)
     monitor.take(np.array([START_NS, START_NS + STEP_NS]), np.array([START_NS, START_NS + STEP_NS]))
     topic = monitor.result(gap_factor=1.8)
-    found = [
-        HealthFinding("a", "info", 1, "x"),
-        HealthFinding("b", "error", 1, "y"),
-        HealthFinding("c", "warning", 1, "z"),
-    ]
+    found = [HealthFinding(name, severity, 1, "x") for name, severity in SEVERITIES]
     return Health("a.mcap", "mcap", (topic,), None, damage, sorted_findings(found), earlier)
 
 

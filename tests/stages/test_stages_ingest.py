@@ -363,6 +363,17 @@ def test_messages_that_do_not_decode_are_counted(tmp_path) -> None:
     assert sum(count for name, count in findings(health).items() if name.endswith("_unreadable")) == 3
 
 
+def test_inertial_samples_that_are_not_finite_are_left_out_and_counted(tmp_path) -> None:
+    inertial = samples(400)
+    for k in (50, 51):
+        topic, kind, log, message = inertial[k]
+        inertial[k] = (topic, kind, log, files.imu(_stamp(message), (np.nan, 0, 0), frame="imu_link"))
+    out, health = run(tmp_path, in_order(clouds(sweeps(20)), inertial))
+    assert findings(health)["imu_not_finite"] == 2
+    with FlightReader(out) as flight:
+        assert len(flight.imu()) == 398
+
+
 def test_damage_is_in_the_health_of_the_flight(tmp_path) -> None:
     path = files.write_mcap(tmp_path / "recording.mcap", in_order(clouds(sweeps(60, columns=100)), samples(1200)))
     data = path.read_bytes()
