@@ -48,11 +48,7 @@ def make_decoder(path: Path, topic: Topic, definition: str) -> Decoder:
             todo="convert the recording, or record ROS messages",
         )
     try:
-        if definition:
-            store = _compiled(topic.msgtype, topic.schema_encoding, definition)
-        else:
-            store = _standard(topic.encoding)
-            store.get_msgdef(topic.msgtype)
+        store = _store_for(topic, definition)
         same = _is_standard(store, topic)
     except Exception as error:
         raise IngestError(
@@ -69,6 +65,14 @@ def make_decoder(path: Path, topic: Topic, definition: str) -> Decoder:
             todo="record the standard message, or rename the type",
         )
     return _decoder(where, topic, store)
+
+
+def _store_for(topic: Topic, definition: str) -> Typestore:
+    if definition:
+        return _compiled(topic.msgtype, topic.schema_encoding, definition)
+    store = _standard(topic.encoding)
+    store.get_msgdef(topic.msgtype)
+    return store
 
 
 def _is_standard(store: Typestore, topic: Topic) -> bool:
