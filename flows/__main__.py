@@ -46,8 +46,7 @@ def _run(given: argparse.Namespace) -> None:
     os.environ.update(settings(None if given.server else home))
     if given.server:
         os.environ["PREFECT_API_URL"] = answering(given.server)
-        _flow(given)
-        return
+        return _flow(given)
     with own_server(home) as ready:
         os.environ["PREFECT_API_URL"] = ready.address
         importlib.import_module("flows.survey")  # takes seconds, as the server does: both at once
