@@ -42,12 +42,12 @@ def main() -> int:
 
 
 def _run(given: argparse.Namespace) -> None:
-    home = given.out / ".mineloc" / "prefect"
-    os.environ.update(settings(None if given.server else home))
+    os.environ.update(settings(None if given.server else given.out / ".mineloc" / "prefect"))
     if given.server:
         os.environ["PREFECT_API_URL"] = answering(given.server)
-        return _flow(given)
-    with own_server(home) as ready:
+        _flow(given)
+        return
+    with own_server(given.out / ".mineloc" / "prefect") as ready:
         os.environ["PREFECT_API_URL"] = ready.address
         importlib.import_module("flows.survey")  # takes seconds, as the server does: both at once
         ready.wait()
