@@ -57,7 +57,7 @@ class SimulateConfig(Section):
     loss: float = Field(default=0.005, ge=0, lt=1, description="share of shots lost by chance")
     dust: float = Field(default=0.0, ge=0, lt=1, description="share of shots that would meet dust in open space")
     dust_depth_m: float = Field(default=1.5, gt=0, description="mean depth at which dust returns")
-    sweep_loss: float = Field(default=0.0, ge=0, lt=1, description="share of sweeps missing, in runs of three on average")
+    sweep_loss: float = Field(default=0.0, ge=0, lt=1, description="share of sweeps missing, in runs of three")
     machine: bool = Field(default=False, description="a loader drives ahead of the drone")
     roadway_width_m: float = Field(default=4.0, ge=1.5, le=30, description="of plans that do not tell (DXF)")
     roadway_height_m: float = Field(default=3.2, ge=1.8, le=30, description="of plans that do not tell (DXF)")

@@ -33,7 +33,7 @@ class Flight:
     scene: Scene
     motion: Motion
     sweeps: int
-    calibration: Calibration = Calibration()
+    calibration: Calibration = field(default_factory=Calibration)
     sigma_m: float = 0.01
     gyro_bias_radps: tuple[float, float, float] = (0.0, 0.0, 0.0)
     accel_bias_mps2: tuple[float, float, float] = (0.0, 0.0, 0.0)
