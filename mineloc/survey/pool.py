@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import IO, cast
@@ -89,7 +90,8 @@ class Pool:
                 worker.wait()
             for pipe in (worker.stdin, worker.stdout):
                 if pipe is not None:
-                    pipe.close()
+                    with suppress(OSError):  # what a dead worker was to be told goes nowhere
+                        pipe.close()
 
     def _start(self) -> subprocess.Popen[bytes]:
         with self._guard, self._log.open("ab") as log:
