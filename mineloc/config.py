@@ -101,6 +101,9 @@ class OdometryConfig(Section):
     patch_growth: float = Field(default=0.2, ge=0, description="share of new points that makes a patch fitted again")
     max_flatness: float = Field(default=0.05, gt=0, lt=0.34, description="a plane's least eigenvalue over their sum")
     min_patch_width_m: float = Field(default=0.05, ge=0, description="a plane spreads so far (1 sigma) both ways")
+    min_incidence_cosine: float = Field(
+        default=0.15, ge=0, lt=1, description="a plane that nearly holds the beam is a scanning cone, not a wall"
+    )
     point_weight: float = Field(default=0.1, ge=0, description="weight of non-planar residuals against planar ones")
     range_sigma_m: float = Field(default=0.02, gt=0)
     angle_sigma_rad: float = Field(default=0.0005, ge=0)
@@ -115,8 +118,8 @@ class OdometryConfig(Section):
     min_matches: int = Field(default=60, ge=6)
     min_inlier_ratio: float = Field(default=0.25, ge=0, le=1)
     weak_ratio: float = Field(default=0.005, ge=0, lt=1, description="eigenvalue ratio below which a direction is weak")
-    angular_radps2: float = Field(default=2.0, gt=0, description="acceleration density, flights without an IMU")
-    linear_mps2: float = Field(default=2.0, gt=0, description="acceleration density, flights without an IMU")
+    angular_radps2: float = Field(default=1.0, gt=0, description="acceleration density, flights without an IMU")
+    linear_mps2: float = Field(default=1.0, gt=0, description="acceleration density, flights without an IMU")
     gyro_radps: float = Field(default=2e-4, gt=0, description="noise density of the gyro")
     accel_mps2: float = Field(default=0.03, gt=0, description="noise density of the accelerometer with vibration")
     gyro_walk_radps2: float = Field(default=1e-5, ge=0)

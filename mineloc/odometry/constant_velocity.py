@@ -16,12 +16,14 @@ _START_SIGMAS = np.repeat([1e-4, 1e-4, 0.5, 2.0], 3)
 class ConstantVelocity:
     """Constant angular rate (body) and velocity (odom), both driven by white acceleration.
 
-    Errors: [rotation, position, rate, velocity], 12 of them.
+    Errors: [rotation, position, rate, velocity], 12 of them: all that a sweep shows.
 
     Args:
         stamp_ns: time of the first pose, which is the identity.
         angular_radps2, linear_mps2: root spectral densities of the accelerations (rad/s²/√Hz, m/s²/√Hz).
     """
+
+    measured: F64 = np.eye(12)
 
     def __init__(self, stamp_ns: int, *, angular_radps2: float, linear_mps2: float) -> None:
         self._densities = (angular_radps2**2, linear_mps2**2)

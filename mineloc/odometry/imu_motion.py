@@ -20,6 +20,14 @@ REST_RADPS, REST_MPS2 = 0.02, 0.1
 FEWEST = 20
 
 
+def _measured() -> F64:
+    out = np.zeros((12, 15))
+    out[:6, :6] = np.eye(6)
+    out[6:9, 9:12] = -np.eye(3)  # a bias is taken off the rate
+    out[9:12, 6:9] = np.eye(3)
+    return out
+
+
 class ImuMotion:
     """Body = IMU. Errors: [rotation, position, velocity, gyro bias, accelerometer bias], 15 of them; z of odom is up.
 
@@ -33,6 +41,8 @@ class ImuMotion:
     Raises:
         ValueError: no samples.
     """
+
+    measured: F64 = _measured()
 
     def __init__(self, stamp_ns: int, first: ImuSamples, *, noise: ImuNoise, T_odom_body: F64 | None = None) -> None:
         if not len(first):

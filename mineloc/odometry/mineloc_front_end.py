@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from mineloc import se3
 from mineloc.config import KeyframeConfig, OdometryConfig
@@ -19,7 +20,7 @@ from mineloc.odometry.imu_motion import ImuMotion
 from mineloc.odometry.information import EdgeNoise, degeneracy_of, edge_information
 from mineloc.odometry.keyframes import KeyframeSelector
 from mineloc.odometry.motion import BodyPath, MotionModel
-from mineloc.odometry.registration import Linearised, Weighting, linearise
+from mineloc.odometry.registration import Linearised, Thinned, Weighting, linearise
 from mineloc.odometry.strapdown import GRAVITY_MPS2, ImuNoise
 from mineloc.odometry.voxel_map import VoxelMap
 from mineloc.sweep.deskew import transform_between_knots
@@ -30,6 +31,8 @@ IMU_GRACE_SWEEPS = 20
 """An IMU that starts so many sweeps late is still taken; the map starts anew then, levelled."""
 FORGET_EVERY = 100
 _CONVERGED_RAD, _CONVERGED_M = 2e-5, 2e-4
+_SHIFT_M = 0.001
+"""A sweep that was deskewed better than this is not deskewed again."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,6 +48,17 @@ class _Registered:
     @property
     def inlier_ratio(self) -> float:
         return self.matches / self.points if self.points else float("nan")
+
+
+def _twist(motion: MotionModel) -> F64:
+    """(6,) [rate (body), velocity (odom)] of the state that the prediction did not have."""
+    return (motion.measured @ motion.deviation())[6:]
+
+
+def _shift_m(twist: F64, sweep: Sweep) -> float:
+    """How far a twist moves a point at 10 m within a sweep."""
+    span_s = 1e-9 * (sweep.end_ns - sweep.stamp_ns)
+    return span_s * float(np.linalg.norm(twist[3:]) + 10.0 * np.linalg.norm(twist[:3]))
 
 
 class MinelocFrontEnd:
@@ -80,8 +94,11 @@ class MinelocFrontEnd:
         motion = self._started(sweep, imu)
         before = motion.stamp_ns, motion.T_odom_body
         path = motion.predict(sweep.stamp_ns, sweep.end_ns)
-        cloud = self._deskewed(sweep, path)
-        registered = self._register(motion, cloud)
+        cloud = self._deskewed(sweep, path, np.zeros(6))
+        registered = self._register(motion, sweep, cloud)
+        twist = _twist(motion)
+        if _shift_m(twist, sweep) > _SHIFT_M:
+            cloud = self._deskewed(sweep, path, twist)
         reason = self._doubt(registered)
         self._coasted_s += (motion.stamp_ns - before[0]) * 1e-9 if reason else 0.0
         self._flown_m += float(np.linalg.norm(motion.T_odom_body[:3, 3] - before[1][:3, 3]))
@@ -130,34 +147,47 @@ class MinelocFrontEnd:
         motion.velocity_mps = self._T_odom_level[:3, :3].T @ before.velocity_mps
         return motion
 
-    def _deskewed(self, sweep: Sweep, path: BodyPath) -> F32:
-        """(n, 3) lidar points as if all were measured at the sweep's end."""
-        T_odom_lidar = path.poses @ self._T_body_lidar
-        T_end_lidar = np.ascontiguousarray((se3.inverse(T_odom_lidar[-1]) @ T_odom_lidar)[:, :3])
+    def _deskewed(self, sweep: Sweep, path: BodyPath, twist: F64) -> F32:
+        """(n, 3) lidar points as if all were measured at the sweep's end, by a path and a twist on top of it."""
+        tau = 1e-9 * (path.stamps_ns - path.stamps_ns[-1])[:, None]
+        turns = Rotation.from_rotvec(tau * twist[:3]).as_matrix()
+        more = se3.from_rt(turns, tau * (path.poses[-1, :3, :3].T @ twist[3:]))
+        T_end_body = more @ se3.inverse(path.poses[-1]) @ path.poses
+        T_end_lidar = se3.inverse(self._T_body_lidar) @ T_end_body @ self._T_body_lidar
         offsets_ns = np.zeros(len(sweep), np.int64) if sweep.offsets_ns is None else sweep.offsets_ns
-        return transform_between_knots(sweep.points_lidar, offsets_ns, path.stamps_ns - sweep.stamp_ns, T_end_lidar)
+        knots_ns, rows = path.stamps_ns - sweep.stamp_ns, np.ascontiguousarray(T_end_lidar[:, :3])
+        return transform_between_knots(sweep.points_lidar, offsets_ns, knots_ns, rows)
 
-    def _register(self, motion: MotionModel, cloud: F32) -> _Registered:
-        """Gauss-Newton on prior and residuals together; without a map or points the prediction stands."""
+    def _thinned(self, sweep: Sweep, cloud: F32) -> Thinned:
         _, label, count = number_voxels(cloud, 1.0 / self._config.sweep_voxel_m)
         ranges = np.bincount(label, minlength=count).astype(np.float64)
-        points_body = se3.apply(self._T_body_lidar, mean_by_label(cloud, label, count))
+        times_s = np.zeros(count)
+        if sweep.offsets_ns is not None and count:
+            times_s = np.bincount(label, 1e-9 * (sweep.offsets_ns - sweep.offsets_ns.max()), count) / ranges
+        return Thinned(se3.apply(self._T_body_lidar, mean_by_label(cloud, label, count)), times_s, ranges)
+
+    def _register(self, motion: MotionModel, sweep: Sweep, cloud: F32) -> _Registered:
+        """Gauss-Newton on prior and residuals together; without a map or points the prediction stands."""
+        thinned = self._thinned(sweep, cloud)
+        count = len(thinned.ranges)
         if not len(self._maps[0]) or not count:
             return _Registered(None, np.zeros((6, 6)), count)
-        prior = np.asarray(np.linalg.inv(motion.covariance), dtype=np.float64)
+        predicted, A = motion.covariance, motion.measured
+        prior = np.asarray(np.linalg.inv(predicted), dtype=np.float64)
         share, rounds = self._config.information_share, self._config.rounds
         while True:
-            last = linearise(points_body, ranges, motion.T_odom_body, self._maps, self._weighting)
-            information, gradient = prior.copy(), prior @ motion.deviation()
-            information[:6, :6] += share * last.H
-            gradient[:6] += share * last.b
+            last = linearise(thinned, motion.T_odom_body, _twist(motion), self._maps, self._weighting)
+            information = prior + share * A.T @ last.H @ A
+            gradient = prior @ motion.deviation() + share * A.T @ last.b
             error = -np.asarray(np.linalg.solve(information, gradient), dtype=np.float64)
             motion.add(error)
             rounds -= 1
             if rounds == 0 or (np.abs(error[:3]).max() < _CONVERGED_RAD and np.abs(error[3:6]).max() < _CONVERGED_M):
                 break
         motion.covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
-        return _Registered(last, self._in_lidar(last.H, motion.T_odom_body), count)
+        twist_prior = np.linalg.inv(A[6:] @ predicted @ A[6:].T) / share
+        H = last.H[:6, :6] - last.H[:6, 6:] @ np.linalg.solve(last.H[6:, 6:] + twist_prior, last.H[6:, :6])
+        return _Registered(last, self._in_lidar(H, motion.T_odom_body), count)
 
     def _in_lidar(self, H: F64, T_odom_body: F64) -> F64:
         """The Hessian of [rotation (body), position (odom)] as one of a right perturbation of the lidar pose."""

@@ -37,11 +37,13 @@ class MotionModel(Protocol):
         stamp_ns: the time of the state.
         T_odom_body: (4, 4) the pose.
         covariance: (n, n) of the errors, n ≥ 6, pose first.
+        measured: (12, n) what a sweep shows of the errors: [rotation, position, rate (body), velocity (odom)].
     """
 
     stamp_ns: int
     T_odom_body: F64
     covariance: F64
+    measured: F64
 
     def predict(self, start_ns: int, end_ns: int) -> BodyPath:
         """Move state and covariance to `end_ns`; the path covers `start_ns` to `end_ns`."""

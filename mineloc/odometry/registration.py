@@ -1,7 +1,10 @@
 """Registration of a sweep to the patches of the map: planar and non-planar residuals in one 6x6 system.
 
-Errors are those of the motion filter: rotation in the body on the right, position in odom,
-`p_odom = R Exp(δθ) p_body + t + δt`. The kernels are compiled; `linearise_plainly` says the same in numpy.
+Errors are those of the motion filter: rotation in the body on the right, position in odom, and the twist, by which the
+points of a sweep lie otherwise than the prediction deskewed them: `p_odom = R Exp(δθ + τ δω) p_body + t + δt + τ δv`
+with τ ≤ 0 the time of the point against the sweep's end. Without the twist a wrong velocity shifts the sweep, the shift
+is taken for motion, and a drone that hovers without an IMU swings itself up. The kernels are compiled;
+`linearise_plainly` says the same in numpy.
 """
 
 from __future__ import annotations
@@ -35,6 +38,7 @@ class Weighting(NamedTuple):
     point_weight: float
     kernel: float
     gate: float
+    min_cosine: float
 
     @staticmethod
     def of(config: OdometryConfig) -> Weighting:
@@ -48,14 +52,30 @@ class Weighting(NamedTuple):
             config.point_weight,
             config.kernel_sigmas,
             config.gate_sigmas,
+            config.min_incidence_cosine,
         )
+
+
+class Thinned(NamedTuple):
+    """What of a sweep is registered: mean points of its voxels.
+
+    Attributes:
+        points_body: (n, 3) deskewed to the sweep's end.
+        times_s: (n,) their mean times against the sweep's end, at most zero.
+        ranges: (n,) of how many ranges each is the mean.
+    """
+
+    points_body: F64
+    times_s: F64
+    ranges: F64
 
 
 class Linearised(NamedTuple):
     """The normal equations `H δ = -b` of one round.
 
     Attributes:
-        H: (6, 6). b: (6,). Both weighted by inverse variances, robust weights included.
+        H: (12, 12) of [rotation (body), position (odom), rate (body), velocity (odom)].
+        b: (12,). Both weighted by inverse variances, robust weights included.
         planar, other, rejected: residuals to planes, to points, and beyond the gate.
         residual_m: root mean square distance from the planes.
     """
@@ -69,24 +89,33 @@ class Linearised(NamedTuple):
 
 
 def linearise(
-    points_body: F64, weights: F64, T_odom_body: F64, maps: tuple[VoxelMap, VoxelMap], w: Weighting
+    sweep: Thinned, T_odom_body: F64, twist: F64, maps: tuple[VoxelMap, VoxelMap], w: Weighting
 ) -> Linearised:
-    """Residuals of (n, 3) points, each the mean of `weights` ranges, against the finer map, else the coarser.
+    """Residuals of the points against the finer map, else the coarser.
 
     A patch that is flat and wide gives a point-to-plane residual. Its variance is the range noise seen along the
     normal, the patch's roughness, and the uncertainty of its plane at that place (a regression's: it grows with the
     distance from the patch's mean). Any other patch gives a point-to-point residual with the patch's own spread: the
     blend that GenZ-ICP showed to be decisive in roadways (METHOD 4.6, 7.1).
+
+    Args:
+        sweep: its points.
+        T_odom_body: (4, 4) at the sweep's end.
+        twist: (6,) [rate (body), velocity (odom)] that came on top since the points were deskewed.
+        maps: finer, coarser.
+        w: noise and robustness.
     """
     fine, coarse = maps
-    R, t = np.ascontiguousarray(T_odom_body[:3, :3]), T_odom_body[:3, 3].copy()
-    Hs, bs, tallies = np.zeros((CHUNKS, 6, 6)), np.zeros((CHUNKS, 6)), np.zeros((CHUNKS, _TALLIES))
-    _linearise(points_body, weights, R, t, fine.arrays, fine.voxel_m, coarse.arrays, coarse.voxel_m, w, Hs, bs, tallies)
+    # upper triangles of Σ w J Jᵀ, Σ w τ J Jᵀ, Σ w τ² J Jᵀ: a point's motion counts τ times its place
+    Hs, bs, tallies = np.zeros((CHUNKS, 3, 6, 6)), np.zeros((CHUNKS, 2, 6)), np.zeros((CHUNKS, _TALLIES))
+    T, twist = np.ascontiguousarray(T_odom_body), np.ascontiguousarray(twist)
+    _linearise(sweep, T, twist, fine.arrays, fine.voxel_m, coarse.arrays, coarse.voxel_m, w, Hs, bs, tallies)
     upper, b, tally = Hs.sum(axis=0), bs.sum(axis=0), tallies.sum(axis=0)
-    H = upper + np.triu(upper, 1).T
+    place, mixed, motion = upper + np.swapaxes(np.triu(upper, 1), 1, 2)
+    H = np.block([[place, mixed], [mixed, motion]])
     planar = int(tally[_PLANAR])
     rms = float(np.sqrt(tally[_SQUARES] / planar)) if planar else float("nan")
-    return Linearised(H, b, planar, int(tally[_OTHER]), int(tally[_REJECTED]), rms)
+    return Linearised(H, b.reshape(12), planar, int(tally[_OTHER]), int(tally[_REJECTED]), rms)
 
 
 @njit(cache=True, nogil=True)
@@ -105,6 +134,7 @@ def _is_plane(fit: F32, min_width_m: float, max_flatness: float) -> bool:
 
     Width is the point: the returns of one ring lie in a line, and range noise spreads them *along the beam*, so that
     the plane fitted to them is the ring's own scanning cone. Such patches tilt a pose by degrees at every junction.
+    Where walls are rough the cone is wide too; hence `min_cosine`: a wall does not hold the beam that measures it.
     """
     return fit[LAMBDA + 1] > min_width_m * min_width_m and fit[LAMBDA] < max_flatness * _spread(fit)
 
@@ -126,18 +156,22 @@ def _plane_variance(fit: F32, e: F64, r: float, cos2: float, d2: float, ranges: 
 
 
 @njit(cache=True, nogil=True)
-def _add_row(H: F64, b: F64, J: F64, p: F64, R: F64, n: F64, residual: float, weight: float) -> None:
-    """One residual along the direction n: J = [p × Rᵀn, n]; the upper triangle of H."""
-    qx = R[0, 0] * n[0] + R[1, 0] * n[1] + R[2, 0] * n[2]
-    qy = R[0, 1] * n[0] + R[1, 1] * n[1] + R[2, 1] * n[2]
-    qz = R[0, 2] * n[0] + R[1, 2] * n[1] + R[2, 2] * n[2]
+def _add_row(H: F64, b: F64, J: F64, p: F64, tau: float, T: F64, n: F64, residual: float, weight: float) -> None:
+    """One residual along the direction n: J = [p × Rᵀn, n], and τ J for the twist; upper triangles of H."""
+    qx = T[0, 0] * n[0] + T[1, 0] * n[1] + T[2, 0] * n[2]
+    qy = T[0, 1] * n[0] + T[1, 1] * n[1] + T[2, 1] * n[2]
+    qz = T[0, 2] * n[0] + T[1, 2] * n[1] + T[2, 2] * n[2]
     J[0], J[1], J[2] = p[1] * qz - p[2] * qy, p[2] * qx - p[0] * qz, p[0] * qy - p[1] * qx
     J[3], J[4], J[5] = n[0], n[1], n[2]
     for j in range(6):
         wj = weight * J[j]
-        b[j] += wj * residual
+        b[0, j] += wj * residual
+        b[1, j] += tau * wj * residual
         for k in range(j, 6):
-            H[j, k] += wj * J[k]
+            h = wj * J[k]
+            H[0, j, k] += h
+            H[1, j, k] += tau * h
+            H[2, j, k] += tau * tau * h
 
 
 @njit(cache=True, nogil=True)
@@ -148,42 +182,52 @@ def _robust(u: float, kernel: float) -> float:
 
 
 @njit(cache=True, nogil=True)
+def _place(point: F64, tau: float, T: F64, twist: F64, p: F64, q: F64, place: F64) -> None:
+    """Where a point lies: p in the body, q turned to odom's axes, its place in odom; the twist to first order."""
+    wx, wy, wz = tau * twist[0], tau * twist[1], tau * twist[2]
+    p[0] = point[0] + wy * point[2] - wz * point[1]
+    p[1] = point[1] + wz * point[0] - wx * point[2]
+    p[2] = point[2] + wx * point[1] - wy * point[0]
+    for a in range(3):
+        q[a] = T[a, 0] * p[0] + T[a, 1] * p[1] + T[a, 2] * p[2]
+        place[a] = q[a] + T[a, 3] + tau * twist[3 + a]
+
+
+@njit(cache=True, nogil=True)
 def _accumulate(
-    points: F64, ranges: F64, start: int, stop: int, R: F64, t: F64,
+    sweep: Thinned, start: int, stop: int, T: F64, twist: F64,
     fine: PatchArrays, fine_m: float, coarse: PatchArrays, coarse_m: float, w: Weighting,
     H: F64, b: F64, tally: F64,
 ) -> None:  # fmt: skip
-    J, n, e, p, q = np.empty(6), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    J, n, e, p, q, at = np.empty(6), np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(start, stop):
-        for a in range(3):
-            p[a] = points[i, a]
-        for a in range(3):
-            q[a] = R[a, 0] * p[0] + R[a, 1] * p[1] + R[a, 2] * p[2]
-        x, y, z = q[0] + t[0], q[1] + t[1], q[2] + t[2]
+        tau = sweep.times_s[i]
+        _place(sweep.points_body[i], tau, T, twist, p, q, at)
         patches = fine
-        row = _patch_at(fine, 1.0 / fine_m, x, y, z)
+        row = _patch_at(fine, 1.0 / fine_m, at[0], at[1], at[2])
         flat = row >= 0 and _is_plane(fine.fits[row], w.min_width_m, w.max_flatness)
         if not flat:
-            wider = _patch_at(coarse, 1.0 / coarse_m, x, y, z)
+            wider = _patch_at(coarse, 1.0 / coarse_m, at[0], at[1], at[2])
             if wider >= 0 and _is_plane(coarse.fits[wider], 2.0 * w.min_width_m, w.max_flatness):
                 patches, row, flat = coarse, wider, True
         if row < 0:
             continue
         fit = patches.fits[row]
-        e[0] = x - patches.centres[row, 0] - fit[MEAN]
-        e[1] = y - patches.centres[row, 1] - fit[MEAN + 1]
-        e[2] = z - patches.centres[row, 2] - fit[MEAN + 2]
+        for a in range(3):
+            e[a] = at[a] - patches.centres[row, a] - fit[MEAN + a]
         if flat:
             n[0], n[1], n[2] = fit[NORMAL], fit[NORMAL + 1], fit[NORMAL + 2]
             r = n[0] * e[0] + n[1] * e[1] + n[2] * e[2]
             d2 = max(p[0] * p[0] + p[1] * p[1] + p[2] * p[2], MIN_LAMBDA_M2)
             cosine = n[0] * q[0] + n[1] * q[1] + n[2] * q[2]
-            variance = _plane_variance(fit, e, r, cosine * cosine / d2, d2, ranges[i], w)
+            if cosine * cosine < w.min_cosine * w.min_cosine * d2:
+                continue  # the plane holds the beam
+            variance = _plane_variance(fit, e, r, cosine * cosine / d2, d2, sweep.ranges[i], w)
             u = r * r / variance
             if u > w.gate * w.gate:
                 tally[_REJECTED] += 1
                 continue
-            _add_row(H, b, J, p, R, n, r, _robust(u, w.kernel) / variance)
+            _add_row(H, b, J, p, tau, T, n, r, _robust(u, w.kernel) / variance)
             tally[_PLANAR] += 1
             tally[_SQUARES] += r * r
         elif w.point_weight > 0:
@@ -196,41 +240,46 @@ def _accumulate(
             for a in range(3):
                 n[0], n[1], n[2] = 0.0, 0.0, 0.0
                 n[a] = 1.0
-                _add_row(H, b, J, p, R, n, e[a], weight)
+                _add_row(H, b, J, p, tau, T, n, e[a], weight)
             tally[_OTHER] += 1
 
 
 @njit(cache=True, parallel=True)
 def _linearise(
-    points: F64, ranges: F64, R: F64, t: F64,
+    sweep: Thinned, T: F64, twist: F64,
     fine: PatchArrays, fine_m: float, coarse: PatchArrays, coarse_m: float, w: Weighting,
     Hs: F64, bs: F64, tallies: F64,
 ) -> None:  # fmt: skip
-    n = len(points)
+    n = len(sweep.points_body)
     size = (n + CHUNKS - 1) // CHUNKS
     for c in prange(CHUNKS):
         _accumulate(
-            points, ranges, c * size, min(n, (c + 1) * size), R, t, fine, fine_m, coarse, coarse_m, w,
+            sweep, c * size, min(n, (c + 1) * size), T, twist, fine, fine_m, coarse, coarse_m, w,
             Hs[c], bs[c], tallies[c],
         )  # fmt: skip
 
 
 def linearise_plainly(
-    points_body: F64, weights: F64, T_odom_body: F64, maps: tuple[VoxelMap, VoxelMap], w: Weighting
+    sweep: Thinned, T_odom_body: F64, twist: F64, maps: tuple[VoxelMap, VoxelMap], w: Weighting
 ) -> Linearised:
     """`linearise` in plain numpy: what the kernel is held to."""
     R, t = T_odom_body[:3, :3], T_odom_body[:3, 3]
-    places = points_body @ R.T + t
+    tau = sweep.times_s[:, None]
+    points = sweep.points_body + np.cross(tau * twist[:3], sweep.points_body)
+    places = points @ R.T + t + tau * twist[3:]
     fit, flat = _chosen_plainly(places, maps, w)
     e = places - fit[:, MEAN : MEAN + 3]
-    # of the place against a right rotation and a translation in odom: [-R [p]x, 1]
-    J = np.concatenate([-R @ se3.hat(points_body), np.tile(np.eye(3), (len(e), 1, 1))], axis=2)
+    # of the place against a right rotation and a translation in odom, [-R [p]x, 1], and against their rates
+    J = np.concatenate([-R @ se3.hat(points), np.tile(np.eye(3), (len(e), 1, 1))], axis=2)
+    J = np.concatenate([J, tau[:, :, None] * J], axis=2)
     r = np.einsum("ni,ni->n", fit[:, NORMAL : NORMAL + 3], e)
+    turned = points @ R.T
+    cosines = np.abs(np.einsum("ni,ni->n", fit[:, NORMAL : NORMAL + 3], turned)) / np.linalg.norm(turned, axis=1)
     variance, square = np.empty(len(e)), np.where(flat, r * r, np.einsum("ni,ni->n", e, e))
-    variance[flat] = _plane_variances_plainly(fit[flat], e[flat], points_body[flat] @ R.T, weights[flat], w)
+    variance[flat] = _plane_variances_plainly(fit[flat], e[flat], turned[flat], sweep.ranges[flat], w)
     variance[~flat] = fit[~flat, LAMBDA : LAMBDA + 3].mean(axis=1) + w.range_sigma_m**2
     u = square / variance
-    seen = (fit[:, COUNT] > 0) & (flat | (w.point_weight > 0))
+    seen = (fit[:, COUNT] > 0) & np.where(flat, cosines >= w.min_cosine, w.point_weight > 0)
     inside = seen & ~(u > w.gate**2)
     weight = inside * np.where(flat, 1.0, w.point_weight) / (1.0 + u / w.kernel**2) ** 2 / variance
     # a plane counts along its normal, a point in every direction
