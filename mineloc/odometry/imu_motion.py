@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mineloc import se3
 from mineloc.data import F64, I64, ImuSamples
 from mineloc.odometry.motion import BodyPath, add_to_pose, exp_so3, pose_deviation
-from mineloc.odometry.strapdown import GRAVITY_MPS2, ImuNoise, integrate
+from mineloc.odometry.strapdown import ImuNoise, Known, integrate
 
 GAP_S = 0.05
 """A longer pause between samples is a hole: what happens in it is guessed, not measured."""
+BRIDGE_S, TURN_S = 1.5, 0.5
+"""Over a shorter hole the samples on both sides are joined; without a sample after it a drone turns on as it did."""
 _START_SIGMAS = np.repeat([0.02, 1e-4, 1.0, 0.003, 0.05], 3)
 
 
@@ -60,6 +61,7 @@ class ImuMotion:
         self.accel_bias_mps2 = np.zeros(3)
         self.covariance: F64 = np.diag(_START_SIGMAS**2)
         self._predicted = self._state()
+        self._before = stamp_ns, self.T_odom_body  # where the last prediction began
 
     def feed(self, samples: ImuSamples) -> None:
         """Take new samples; older ones than the state needs are dropped, repeated ones ignored."""
@@ -72,17 +74,17 @@ class ImuMotion:
         self._samples = ImuSamples(stamps[first:], gyro, accel)
 
     def predict(self, start_ns: int, end_ns: int) -> BodyPath:
-        """Integrate to `end_ns`. Beyond the samples the last ones are held, and the covariance says so."""
-        stamps, gyro, accel = self._nodes(end_ns)
-        rates, forces = gyro - self.gyro_bias_radps, accel - self.accel_bias_mps2
-        times_s, guessed = np.asarray((stamps - self.stamp_ns) * 1e-9, np.float64), self._guessed(stamps)
+        """Integrate to `end_ns`. What happens in a hole of the samples is guessed, and the covariance says so."""
+        stamps, gyro, accel, known = self._steps(end_ns)
+        self._before = self.stamp_ns, self.T_odom_body
         start = self.T_odom_body, self.velocity_mps, self.covariance
-        moved = integrate(times_s, rates, forces, guessed, *start, self._noise)
+        times_s = np.asarray((stamps - self.stamp_ns) * 1e-9, dtype=np.float64)
+        moved = integrate(times_s, gyro, accel, known, *start, self._noise)
         poses = moved.poses
         if start_ns < self.stamp_ns:
             # the sweep began a little before the last one ended
             back = -1e-9 * (self.stamp_ns - start_ns)
-            first = se3.from_rt(poses[0, :3, :3] @ exp_so3(back * rates[0]), poses[0, :3, 3] + back * self.velocity_mps)
+            first = se3.from_rt(poses[0, :3, :3] @ exp_so3(back * gyro[0]), poses[0, :3, 3] + back * self.velocity_mps)
             stamps = np.concatenate([np.array([start_ns]), stamps])
             poses = np.concatenate([first[None], poses])
         self.velocity_mps, self.covariance = moved.velocity_mps, moved.covariance
@@ -108,29 +110,42 @@ class ImuMotion:
     def _state(self) -> tuple[F64, F64, F64, F64]:
         return self.T_odom_body, self.velocity_mps, self.gyro_bias_radps, self.accel_bias_mps2
 
-    def _nodes(self, end_ns: int) -> tuple[I64, F64, F64]:
+    def _steps(self, end_ns: int) -> tuple[I64, F64, F64, Known]:
+        """(m,) nodes up to `end_ns`; mean rate and force of the (m - 1) steps between, and what is known of them."""
         s = self._samples
         inside = (s.stamps_ns > self.stamp_ns) & (s.stamps_ns < end_ns)
         stamps = np.concatenate([np.array([self.stamp_ns]), s.stamps_ns[inside], np.array([end_ns])])
-        if not len(s):
-            rest = se3.inverse(self.T_odom_body)[:3, 2] * GRAVITY_MPS2 + self.accel_bias_mps2
-            return stamps, np.tile(self.gyro_bias_radps, (2, 1)), np.tile(rest, (2, 1))
-        x, at = stamps - self.stamp_ns, s.stamps_ns - self.stamp_ns
-        gyro = np.stack([np.interp(x, at, column) for column in s.gyro_radps.T], axis=1)
-        accel = np.stack([np.interp(x, at, column) for column in s.accel_mps2.T], axis=1)
-        return stamps, gyro, accel
+        known = self._known(stamps)
+        gyro, accel = np.zeros((len(stamps) - 1, 3)), np.zeros((len(stamps) - 1, 3))
+        if len(s):
+            x, at = stamps - self.stamp_ns, s.stamps_ns - self.stamp_ns
+            for means, measured in ((gyro, s.gyro_radps), (accel, s.accel_mps2)):
+                nodes = np.stack([np.interp(x, at, column) for column in measured.T], axis=1)
+                means[:] = 0.5 * (nodes[:-1] + nodes[1:])
+        gyro, accel = gyro - self.gyro_bias_radps, accel - self.accel_bias_mps2
+        short = np.diff(stamps) < TURN_S * 1e9
+        gyro[known.blind] = np.where(short[known.blind, None], self._turning(), 0.0)
+        return stamps, gyro, accel, known
 
-    def _guessed(self, stamps_ns: I64) -> NDArray[np.bool_]:
-        """(m - 1,) which steps between the nodes lie in a hole of the samples, however short the steps are."""
-        known = self._samples.stamps_ns
-        if not len(known):
-            return np.ones(len(stamps_ns) - 1, np.bool_)
+    def _turning(self) -> F64:
+        """(3,) mean rate since the last prediction, as registration saw it."""
+        stamp_ns, T = self._before
+        turn = pose_deviation(self.T_odom_body, T)[:3]
+        return turn / max((self.stamp_ns - stamp_ns) * 1e-9, 1e-3)
+
+    def _known(self, stamps_ns: I64) -> Known:
+        """Which of the (m - 1) steps between the nodes lie in a hole of the samples, however short the steps are."""
+        at = self._samples.stamps_ns
+        if not len(at):
+            return Known(np.ones(len(stamps_ns) - 1, np.bool_), np.ones(len(stamps_ns) - 1, np.bool_))
         start, end = stamps_ns[:-1], stamps_ns[1:]
-        before = np.searchsorted(known, start, side="right") - 1
-        after = np.searchsorted(known, end, side="left")
-        since = np.where(before >= 0, known[np.maximum(before, 0)], start)
-        until = np.where(after < len(known), known[np.minimum(after, len(known) - 1)], end)
-        return (until - since) * 1e-9 > GAP_S
+        before = np.searchsorted(at, start, side="right") - 1
+        after = np.searchsorted(at, end, side="left")
+        open_sided = (before < 0) | (after == len(at))
+        since = np.where(before >= 0, at[np.maximum(before, 0)], start)
+        until = np.where(after < len(at), at[np.minimum(after, len(at) - 1)], end)
+        guessed = (until - since) * 1e-9 > GAP_S
+        return Known(guessed, guessed & (open_sided | ((until - since) * 1e-9 > BRIDGE_S)))
 
 
 def _calm_part(first: ImuSamples) -> ImuSamples:
