@@ -238,18 +238,25 @@ class FlightWriter:
         """Write the pending messages up to a time (all of them for None), in order of time."""
         if (layout.TF_STATIC, 0) not in self._channels:
             self._emit_calibration(end_ns)
-        due: list[tuple[int, int, memoryview]] = []
+        ready: list[tuple[int, I64, U8]] = []
         for batch in self._pending:
             stop = len(batch.stamps_ns)
             if end_ns is not None:
                 stop = int(np.searchsorted(batch.stamps_ns, end_ns, side="right"))
             if stop > batch.done:
                 part = slice(batch.done, stop)
-                stamps: list[int] = batch.stamps_ns[part].tolist()
-                messages = [memoryview(row) for row in batch.encode(part)]
-                due += zip(stamps, [batch.channel] * len(stamps), messages, strict=True)
+                ready.append((batch.channel, batch.stamps_ns[part], batch.encode(part)))
                 batch.done = stop
         self._pending = [batch for batch in self._pending if batch.done < len(batch.stamps_ns)]
+        if len({channel for channel, _, _ in ready}) == 1:
+            for channel, stamps_ns, rows in ready:
+                self._open_mcap.add_messages(channel, stamps_ns, rows, group=_REST)
+            return
+        due = [
+            (stamp_ns, channel, memoryview(row))
+            for channel, stamps_ns, rows in ready
+            for stamp_ns, row in zip(stamps_ns.tolist(), rows, strict=True)
+        ]
         due.sort(key=lambda message: message[:2])
         for stamp_ns, channel, message in due:
             self._open_mcap.add_message(channel, stamp_ns, message, group=_REST)
