@@ -118,7 +118,7 @@ class OdometryConfig(Section):
     min_matches: int = Field(default=60, ge=6)
     min_inlier_ratio: float = Field(default=0.25, ge=0, le=1)
     weak_ratio: float = Field(default=0.005, ge=0, lt=1, description="eigenvalue ratio below which a direction is weak")
-    angular_radps2: float = Field(default=1.0, gt=0, description="acceleration density, flights without an IMU")
+    angular_radps2: float = Field(default=0.5, gt=0, description="acceleration density, flights without an IMU")
     linear_mps2: float = Field(default=1.0, gt=0, description="acceleration density, flights without an IMU")
     gyro_radps: float = Field(default=2e-4, gt=0, description="noise density of the gyro")
     accel_mps2: float = Field(default=0.03, gt=0, description="noise density of the accelerometer with vibration")

@@ -16,11 +16,6 @@ BRIDGE_S, TURN_S = 1.5, 0.5
 _START_SIGMAS = np.repeat([0.02, 1e-4, 1.0, 0.003, 0.05], 3)
 
 
-REST_RADPS, REST_MPS2 = 0.02, 0.1
-"""At rest the gyro's mean is below the first, and the mean force of two halves differs by less than the second."""
-FEWEST = 20
-
-
 def _measured() -> F64:
     out = np.zeros((12, 15))
     out[:6, :6] = np.eye(6)
@@ -36,28 +31,21 @@ class ImuMotion:
     LiDARs (METHOD 4.1, 7.3).
 
     Args:
-        first: samples of the first moments; the mean of those at rest says where up is, and the gyro bias.
-        T_odom_body: (4, 4) start pose; its heading and position are kept, its roll and pitch are levelled.
-
-    Raises:
-        ValueError: no samples.
+        stamp_ns: time of the first pose.
+        T_odom_body: (4, 4) that pose, levelled.
+        noise: of the samples.
+        gyro_bias_radps: (3,) as far as it is known.
     """
 
     measured: F64 = _measured()
 
-    def __init__(self, stamp_ns: int, first: ImuSamples, *, noise: ImuNoise, T_odom_body: F64 | None = None) -> None:
-        if not len(first):
-            raise ValueError("an IMU model needs samples to find up")
+    def __init__(self, stamp_ns: int, T_odom_body: F64, *, noise: ImuNoise, gyro_bias_radps: F64 | None = None) -> None:
         self._noise = noise
         self._samples = ImuSamples.empty()
         self.stamp_ns = stamp_ns
-        start = np.eye(4) if T_odom_body is None else T_odom_body
-        calm = _calm_part(first)
-        up_odom = start[:3, :3] @ calm.accel_mps2.mean(axis=0)
-        self.T_odom_body = se3.from_rt(se3.rotation_between(up_odom, [0, 0, 1]) @ start[:3, :3], start[:3, 3])
+        self.T_odom_body = T_odom_body
         self.velocity_mps = np.zeros(3)
-        rate = calm.gyro_radps.mean(axis=0)
-        self.gyro_bias_radps = rate if float(np.linalg.norm(rate)) < REST_RADPS else np.zeros(3)
+        self.gyro_bias_radps: F64 = np.zeros(3) if gyro_bias_radps is None else gyro_bias_radps
         self.accel_bias_mps2 = np.zeros(3)
         self.covariance: F64 = np.diag(_START_SIGMAS**2)
         self._predicted = self._state()
@@ -146,15 +134,3 @@ class ImuMotion:
         until = np.where(after < len(at), at[np.minimum(after, len(at) - 1)], end)
         guessed = (until - since) * 1e-9 > GAP_S
         return Known(guessed, guessed & (open_sided | ((until - since) * 1e-9 > BRIDGE_S)))
-
-
-def _calm_part(first: ImuSamples) -> ImuSamples:
-    """The longest beginning in which the drone seems to rest, halving while it does not; at least `FEWEST` samples."""
-    n = len(first)
-    while n > FEWEST:
-        early, late = first.accel_mps2[: n // 2].mean(axis=0), first.accel_mps2[n // 2 : n].mean(axis=0)
-        turning = float(np.linalg.norm(first.gyro_radps[:n].mean(axis=0)))
-        if turning < REST_RADPS and float(np.linalg.norm(late - early)) < REST_MPS2:
-            break
-        n //= 2
-    return ImuSamples(first.stamps_ns[:n], first.gyro_radps[:n], first.accel_mps2[:n])

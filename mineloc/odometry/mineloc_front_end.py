@@ -15,22 +15,19 @@ from mineloc import se3
 from mineloc.config import KeyframeConfig, OdometryConfig
 from mineloc.data import F32, F64, Calibration, Degeneracy, ImuSamples, Keyframe, OdometryStep, RelativePose, Sweep
 from mineloc.errors import FlightError
-from mineloc.odometry.constant_velocity import ConstantVelocity
-from mineloc.odometry.imu_motion import ImuMotion
 from mineloc.odometry.information import EdgeNoise, degeneracy_of, edge_information
 from mineloc.odometry.keyframes import KeyframeSelector
+from mineloc.odometry.model_choice import ModelChoice
 from mineloc.odometry.motion import BodyPath, MotionModel
 from mineloc.odometry.registration import Linearised, Thinned, Weighting, linearise
-from mineloc.odometry.strapdown import GRAVITY_MPS2, ImuNoise
 from mineloc.odometry.voxel_map import VoxelMap
 from mineloc.sweep.deskew import transform_between_knots
 from mineloc.sweep.voxel_grid import mean_by_label, number_voxels, voxel_centroids
 
-MIN_IMU_SAMPLES = 5
-IMU_GRACE_SWEEPS = 20
-"""An IMU that starts so many sweeps late is still taken; the map starts anew then, levelled."""
 FORGET_EVERY = 100
 _CONVERGED_RAD, _CONVERGED_M = 2e-5, 2e-4
+LOST_SWEEPS = 10
+"""After so many sweeps that the map does not hold, the motion model begins anew."""
 _SHIFT_M = 0.001
 """A sweep that was deskewed better than this is not deskewed again."""
 
@@ -76,14 +73,12 @@ class MinelocFrontEnd:
         self._config, self._keyframe_config = config, keyframes
         self._selector = KeyframeSelector(keyframes)
         self._weighting = Weighting.of(config)
-        self._T_lidar_imu = calibration.T_lidar_imu
-        self._T_body_lidar: F64 = np.eye(4)
-        self._T_odom_level: F64 = np.eye(4)  # differs when the IMU came late: its odom is level, the one told is not
-        self._motion: MotionModel | None = None
+        self._choice = ModelChoice(config, calibration.T_lidar_imu)
         self._maps = self._new_maps()
         self._sweeps = 0
         self._flown_m = 0.0
         self._coasted_s = 0.0
+        self._lost_sweeps = 0
 
     def step(self, sweep: Sweep, imu: ImuSamples) -> OdometryStep:
         """Deskew by the predicted motion, register to the patches inside the motion prior, grow the map.
@@ -91,7 +86,7 @@ class MinelocFrontEnd:
         Raises:
             FlightError: the sweep is not later than the one before; an IMU that does not measure gravity.
         """
-        motion = self._started(sweep, imu)
+        motion = self._model(sweep, imu)
         before = motion.stamp_ns, motion.T_odom_body
         path = motion.predict(sweep.stamp_ns, sweep.end_ns)
         cloud = self._deskewed(sweep, path, np.zeros(6))
@@ -101,51 +96,27 @@ class MinelocFrontEnd:
             cloud = self._deskewed(sweep, path, twist)
         reason = self._doubt(registered)
         self._coasted_s += (motion.stamp_ns - before[0]) * 1e-9 if reason else 0.0
+        self._lost_sweeps = self._lost_sweeps + 1 if reason and registered.points else 0
         self._flown_m += float(np.linalg.norm(motion.T_odom_body[:3, 3] - before[1][:3, 3]))
-        self._grow_map(motion, cloud)
-        self._sweeps += 1
-        return self._told(motion, cloud, registered, reason)
+        if self._choice.follow(imu):
+            self._maps = self._new_maps()
+        self._grow_map(cloud)
+        return self._told(motion.stamp_ns, cloud, registered, reason)
 
-    def _started(self, sweep: Sweep, imu: ImuSamples) -> MotionModel:
-        """The motion model, made at the first sweep, or anew when an IMU begins a little late."""
-        c, motion = self._config, self._motion
-        if motion is not None and sweep.end_ns <= motion.stamp_ns:
+    def _model(self, sweep: Sweep, imu: ImuSamples) -> MotionModel:
+        """The motion model for a sweep; with a new one the map begins anew too."""
+        before = self._choice.motion
+        if before is not None and sweep.end_ns <= before.stamp_ns:
             raise FlightError(
                 "odometry",
-                f"a sweep ends at {sweep.end_ns} ns, not after the one before ({motion.stamp_ns} ns)",
+                f"a sweep ends at {sweep.end_ns} ns, not after the one before ({before.stamp_ns} ns)",
                 expected="time going forwards",
                 todo="ingest the recording again: it names and drops such sweeps",
             )
-        late = isinstance(motion, ConstantVelocity) and self._sweeps <= IMU_GRACE_SWEEPS
-        if c.use_imu and len(imu) >= MIN_IMU_SAMPLES and (motion is None or late):
-            motion = self._start_imu(sweep, imu, motion)
-        elif motion is None:
-            motion = ConstantVelocity(sweep.stamp_ns - 1, angular_radps2=c.angular_radps2, linear_mps2=c.linear_mps2)
-        if isinstance(motion, ImuMotion):
-            motion.feed(imu)
-        self._motion = motion
-        return motion
-
-    def _start_imu(self, sweep: Sweep, imu: ImuSamples, before: MotionModel | None) -> ImuMotion:
-        c = self._config
-        force = float(np.linalg.norm(imu.accel_mps2.mean(axis=0)))
-        if not 0.7 * GRAVITY_MPS2 < force < 1.3 * GRAVITY_MPS2:
-            raise FlightError(
-                "odometry",
-                f"the IMU's mean specific force is {force:.2f}",
-                expected="about 9.81 m/s² (gravity)",
-                todo="check its unit (g instead of m/s²?) in the sequence file, or --set odometry.use_imu=false",
-            )
-        noise = ImuNoise(c.gyro_radps, c.accel_mps2, c.gyro_walk_radps2, c.accel_walk_mps3)
-        self._T_body_lidar = se3.inverse(self._T_lidar_imu)
-        self._maps = self._new_maps()
-        if not isinstance(before, ConstantVelocity):
-            return ImuMotion(sweep.stamp_ns - 1, imu, noise=noise)
-        T_odom_imu = before.T_odom_body @ self._T_lidar_imu
-        motion = ImuMotion(before.stamp_ns, imu, noise=noise, T_odom_body=T_odom_imu)
-        self._T_odom_level = T_odom_imu @ se3.inverse(motion.T_odom_body)
-        motion.velocity_mps = self._T_odom_level[:3, :3].T @ before.velocity_mps
-        return motion
+        if self._lost_sweeps > LOST_SWEEPS:
+            self._choice.give_up()
+            self._maps, self._lost_sweeps = self._new_maps(), 0
+        return self._choice.begin(sweep, imu)
 
     def _deskewed(self, sweep: Sweep, path: BodyPath, twist: F64) -> F32:
         """(n, 3) lidar points as if all were measured at the sweep's end, by a path and a twist on top of it."""
@@ -153,7 +124,7 @@ class MinelocFrontEnd:
         turns = Rotation.from_rotvec(tau * twist[:3]).as_matrix()
         more = se3.from_rt(turns, tau * (path.poses[-1, :3, :3].T @ twist[3:]))
         T_end_body = more @ se3.inverse(path.poses[-1]) @ path.poses
-        T_end_lidar = se3.inverse(self._T_body_lidar) @ T_end_body @ self._T_body_lidar
+        T_end_lidar = se3.inverse(self._choice.T_body_lidar) @ T_end_body @ self._choice.T_body_lidar
         offsets_ns = np.zeros(len(sweep), np.int64) if sweep.offsets_ns is None else sweep.offsets_ns
         knots_ns, rows = path.stamps_ns - sweep.stamp_ns, np.ascontiguousarray(T_end_lidar[:, :3])
         return transform_between_knots(sweep.points_lidar, offsets_ns, knots_ns, rows)
@@ -164,7 +135,7 @@ class MinelocFrontEnd:
         times_s = np.zeros(count)
         if sweep.offsets_ns is not None and count:
             times_s = np.bincount(label, 1e-9 * (sweep.offsets_ns - sweep.offsets_ns.max()), count) / ranges
-        return Thinned(se3.apply(self._T_body_lidar, mean_by_label(cloud, label, count)), times_s, ranges)
+        return Thinned(se3.apply(self._choice.T_body_lidar, mean_by_label(cloud, label, count)), times_s, ranges)
 
     def _register(self, motion: MotionModel, sweep: Sweep, cloud: F32) -> _Registered:
         """Gauss-Newton on prior and residuals together; without a map or points the prediction stands."""
@@ -193,43 +164,47 @@ class MinelocFrontEnd:
         """The Hessian of [rotation (body), position (odom)] as one of a right perturbation of the lidar pose."""
         to_body = np.eye(6)
         to_body[3:, 3:] = T_odom_body[:3, :3]
-        A = to_body @ se3.adjoint(self._T_body_lidar)
+        A = to_body @ se3.adjoint(self._choice.T_body_lidar)
         return A.T @ H @ A
 
     def _doubt(self, registered: _Registered) -> str:
         """Why a pose rests on the motion prior alone; empty if it does not."""
         c = self._config
-        if self._sweeps == 0:
-            return "" if registered.points else "the sweep has no points"
+        if not registered.points:
+            return "the sweep has no points"
+        if registered.last is None:
+            return "" if self._selector.index < 0 else "the map begins anew"
         if registered.matches < c.min_matches:
             return f"{registered.matches} matches, at least {c.min_matches} needed"
         if registered.inlier_ratio < c.min_inlier_ratio:
             return f"inlier ratio {registered.inlier_ratio:.2f}, at least {c.min_inlier_ratio} needed"
         return ""
 
-    def _grow_map(self, motion: MotionModel, cloud: F32) -> None:
+    def _grow_map(self, cloud: F32) -> None:
         if len(cloud):
             thin = voxel_centroids(cloud, self._config.insert_voxel_m)
-            points = se3.apply(motion.T_odom_body @ self._T_body_lidar, thin)
+            points = se3.apply(self._choice.T_odom_lidar, thin)
             for patches in self._maps:
                 patches.insert(points, now=self._flown_m)
-        if self._sweeps % FORGET_EVERY == FORGET_EVERY - 1:
+        self._sweeps += 1
+        if self._sweeps % FORGET_EVERY == 0:
             for patches in self._maps:
                 patches.forget(self._flown_m - self._config.forget_after_m)
 
-    def _told(self, motion: MotionModel, cloud: F32, registered: _Registered, reason: str) -> OdometryStep:
-        T_odom_lidar = self._T_odom_level @ motion.T_odom_body @ self._T_body_lidar
+    def _told(self, stamp_ns: int, cloud: F32, registered: _Registered, reason: str) -> OdometryStep:
+        T_odom_lidar = self._choice.T_told_lidar
         last = registered.last
         degeneracy = None
         if last is not None:
             degeneracy = degeneracy_of(registered.hessian_lidar, registered.matches, weak_ratio=self._config.weak_ratio)
         keyframe, edge = None, None
-        if len(cloud) and self._selector.consider(motion.stamp_ns, T_odom_lidar):
-            keyframe = self._keyframe(motion, cloud, T_odom_lidar)
+        if len(cloud) and self._selector.consider(stamp_ns, T_odom_lidar):
+            points = voxel_centroids(cloud, self._keyframe_config.voxel_m)
+            keyframe = Keyframe(self._selector.index, stamp_ns, T_odom_lidar, points, self._choice.up_lidar)
             edge = self._edge(registered, degeneracy)
             self._coasted_s = 0.0
         return OdometryStep(
-            stamp_ns=motion.stamp_ns,
+            stamp_ns=stamp_ns,
             T_odom_lidar=T_odom_lidar,
             trusted=not reason,
             reason=reason,
@@ -240,11 +215,6 @@ class MinelocFrontEnd:
             residual_m=float("nan") if last is None else last.residual_m,
             points_used=registered.points,
         )
-
-    def _keyframe(self, motion: MotionModel, cloud: F32, T_odom_lidar: F64) -> Keyframe:
-        up = (motion.T_odom_body @ self._T_body_lidar)[2, :3] if isinstance(motion, ImuMotion) else None
-        points = voxel_centroids(cloud, self._keyframe_config.voxel_m)
-        return Keyframe(self._selector.index, motion.stamp_ns, T_odom_lidar, points, up)
 
     def _edge(self, registered: _Registered, degeneracy: Degeneracy | None) -> RelativePose | None:
         T_i_j, j = self._selector.T_before_last, self._selector.index

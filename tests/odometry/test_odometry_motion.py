@@ -49,7 +49,7 @@ def test_what_is_added_to_a_pose_is_its_deviation(seed: int) -> None:
 def moving_models() -> list[MotionModel]:
     velocity = ConstantVelocity(START_NS, angular_radps2=1.0, linear_mps2=1.0)
     velocity.add(np.concatenate([np.zeros(6), [0.1, 0.2, -0.3], [1.0, 2.0, 3.0]]))
-    imu = ImuMotion(START_NS, at_rest().imu(START_NS, START_NS + SWEEP_NS), noise=NOISE)
+    imu = ImuMotion(START_NS, np.eye(4), noise=NOISE)
     imu.feed(tumbling().imu(START_NS, START_NS + SWEEP_NS))
     return [velocity, imu]
 
@@ -139,10 +139,8 @@ def test_constant_velocity_is_as_unsure_in_parts_as_in_one(parts: int) -> None:
 
 def started(truth: Motion, *, end_ns: int, rate_hz: float = 200.0) -> ImuMotion:
     """A model that knows how the motion begins, with ideal samples."""
-    model = ImuMotion(START_NS, at_rest().imu(START_NS, START_NS + SWEEP_NS), noise=NOISE)
-    model.T_odom_body = truth.at(np.array([START_NS]))[0]
+    model = ImuMotion(START_NS, truth.at(np.array([START_NS]))[0], noise=NOISE)
     model.velocity_mps = truth.velocity(0.0)
-    model.gyro_bias_radps = np.zeros(3)
     model.feed(truth.imu(START_NS, end_ns, rate_hz=rate_hz))
     return model
 
@@ -212,32 +210,6 @@ def test_the_imu_model_knows_its_own_error() -> None:
     ratio = sigmas_of(errors, exact.covariance[:9, :9])
     assert (1 - spread) ** 2 * 0.85 < ratio.min()
     assert ratio.max() < (1 + spread) ** 2 * 1.15
-
-
-@settings(deadline=None)
-@given(roll=st.floats(-0.6, 0.6), pitch=st.floats(-0.6, 0.6), yaw=st.floats(-3, 3))
-def test_the_start_is_levelled_and_keeps_place_and_heading(roll: float, pitch: float, yaw: float) -> None:
-    imu = at_rest((roll, pitch, 0.0)).imu(START_NS, START_NS + SWEEP_NS)
-    model = ImuMotion(START_NS, imu, noise=NOISE)
-    assert model.T_odom_body[2, :3] @ imu.accel_mps2[0] == pytest.approx(9.80665)
-    assert not model.T_odom_body[:3, 3].any()
-    # a start that is levelled already stays as it is
-    T = se3.from_rt(Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix(), [1.0, 2.0, 3.0])
-    assert np.allclose(ImuMotion(START_NS, imu, noise=NOISE, T_odom_body=T).T_odom_body, T, atol=1e-9)
-
-
-def test_the_gyro_bias_is_taken_from_a_drone_at_rest_only() -> None:
-    resting, turning = (
-        replace(at_rest().imu(START_NS, START_NS + SWEEP_NS), gyro_radps=np.tile(rate, (20, 1)))
-        for rate in ([0.004, -0.003, 0.002], [0.0, 0.0, 0.3])
-    )
-    assert ImuMotion(START_NS, resting, noise=NOISE).gyro_bias_radps == pytest.approx([0.004, -0.003, 0.002])
-    assert not ImuMotion(START_NS, turning, noise=NOISE).gyro_bias_radps.any()
-
-
-def test_without_samples_there_is_no_imu_model() -> None:
-    with pytest.raises(ValueError, match="samples"):
-        ImuMotion(START_NS, ImuSamples.empty(), noise=NOISE)
 
 
 @settings(deadline=None, max_examples=20)
@@ -312,7 +284,7 @@ def test_in_a_long_hole_the_drone_stops_turning() -> None:
 
 
 def test_an_imu_that_never_came_leaves_the_drone_where_it_goes() -> None:
-    model = ImuMotion(START_NS, at_rest((0.2, 0.1, 0.0)).imu(START_NS, START_NS + SWEEP_NS), noise=NOISE)
+    model = ImuMotion(START_NS, at_rest((0.2, 0.1, 0.0)).at(np.array([START_NS]))[0], noise=NOISE)
     model.velocity_mps = np.array([1.0, 0.0, 0.0])
     model.predict(START_NS, START_NS + 10 * SWEEP_NS)
     assert model.T_odom_body[:3, 3] == pytest.approx([1.0, 0.0, 0.0], abs=1e-9)
