@@ -123,7 +123,7 @@ def measure(side: str, path: Path, out: Path) -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recording", type=Path)
-    parser.add_argument("--sweeps", type=int, default=600)
+    parser.add_argument("--sweeps", type=int, default=1800, help="ten a second")
     parser.add_argument("--compression", choices=["lz4", "zstd", "none"], default="lz4")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--again", action="store_true", help="ingest the flight that ingest made")
