@@ -31,6 +31,12 @@ def inverse(T: F64) -> F64:
     return from_rt(r, -np.einsum("...ij,...j->...i", r, T[..., :3, 3]))
 
 
+def rigid(T: F64) -> F64:
+    """(…, 4, 4) with orthonormal rotations: rounding grows along a chain of products, and `inverse` doubles it."""
+    r = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_matrix().reshape(*T.shape[:-2], 3, 3)
+    return from_rt(r, T[..., :3, 3])
+
+
 def apply(T: F64, points: ArrayLike) -> F64:
     """Take (n, 3) points through one (4, 4) transform, float64 out."""
     return np.asarray(points, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]

@@ -91,6 +91,7 @@ def solve(graph: PoseGraph, *, initial: F64 | None = None) -> Solution:
     is_robust = graph.config.robust and any(factor.kind in ROBUST for factor in graph.factors)
     for width in (*_WIDTHS, 1.0) if is_robust else (1.0,):
         params = gtsam.LevenbergMarquardtParams()
+        params.setLinearSolverType("MULTIFRONTAL_QR")
         params.setMaxIterations(graph.config.max_iterations)
         params.setRelativeErrorTol(_LAST_TOLERANCE if width == 1.0 else _EARLY_TOLERANCE)
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph.gtsam_graph(widened=width), values, params)
@@ -110,8 +111,12 @@ def solve(graph: PoseGraph, *, initial: F64 | None = None) -> Solution:
 
 
 def _marginals(graph: PoseGraph, values: Any) -> F64:
-    marginals = gtsam.Marginals(graph.gtsam_graph(), values)
-    return np.array([marginals.marginalCovariance(index) for index in range(len(graph))])
+    """gtsam's `Marginals` knows Cholesky alone, for which a flight of some thousand keyframes is indeterminate."""
+    params = gtsam.ISAM2Params()
+    params.setFactorization("QR")
+    isam = gtsam.ISAM2(params)
+    isam.update(graph.gtsam_graph(), values)
+    return np.array([isam.marginalCovariance(index) for index in range(len(graph))])
 
 
 def _distances(graph: PoseGraph, values: Any) -> F64:

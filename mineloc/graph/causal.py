@@ -24,6 +24,7 @@ class CausalEstimate:
         params = gtsam.ISAM2Params()
         params.setRelinearizeThreshold(graph.config.relinearize_threshold)
         params.relinearizeSkip = _RELINEARIZE_EVERY
+        params.setFactorization("QR")  # with Cholesky a chain of 700 keyframes can be indeterminate
         self._graph = graph
         self._isam = gtsam.ISAM2(params)
         self._factors = 0
@@ -62,4 +63,4 @@ class CausalEstimate:
 
     def _carried(self, index: int) -> F64:
         initial = self._graph.initial
-        return self._newest @ se3.inverse(initial[self._known - 1]) @ initial[index]
+        return se3.rigid(self._newest @ se3.inverse(initial[self._known - 1]) @ initial[index])

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import gtsam
 import numpy as np
 
+from mineloc import se3
 from mineloc.config import GraphConfig
 from mineloc.data import F64, Fix, Keyframe, RelativePose
 from mineloc.graph.measurements import PointFix
@@ -94,7 +95,7 @@ class PoseGraph:
         noise = edge_noise(relative.information, self.config)
         gravity = self._gravity(keyframe)
         self.weak_edges += noise.is_weak
-        self.initial.append(self.initial[-1] @ relative.T_i_j)
+        self.initial.append(se3.rigid(self.initial[-1] @ relative.T_i_j))
         self._add_between("relative", relative, noise.covariance)
         self.factors += gravity
 

@@ -37,9 +37,8 @@ class ConstantVelocity:
         """Move on; the path is the same motion seen backwards from the end, so it may start before the last state."""
         dt = (end_ns - self.stamp_ns) * 1e-9
         turn = Rotation.from_rotvec(dt * self.rate_radps).as_matrix()
-        self.T_odom_body = se3.from_rt(
-            self.T_odom_body[:3, :3] @ turn, self.T_odom_body[:3, 3] + dt * self.velocity_mps
-        )
+        position = self.T_odom_body[:3, 3] + dt * self.velocity_mps
+        self.T_odom_body = se3.rigid(se3.from_rt(self.T_odom_body[:3, :3] @ turn, position))
         self.stamp_ns = end_ns
         F = np.eye(12)
         F[:3, :3] = turn.T

@@ -76,6 +76,7 @@ class ImuMotion:
             stamps = np.concatenate([np.array([start_ns]), stamps])
             poses = np.concatenate([first[None], poses])
         self.velocity_mps, self.covariance = moved.velocity_mps, moved.covariance
+        poses[-1] = se3.rigid(poses[-1])
         self.T_odom_body, self.stamp_ns = poses[-1], end_ns
         self._predicted = self._state()
         return BodyPath(stamps, poses)

@@ -88,7 +88,7 @@ class LoamFrontEnd:
         T_last_lidar = self._predict(last, end_ns)
         features = features.deskewed(last.twist_lidar, target_ns=end_ns)
         odometry = self._sweep_to_sweep(last, features, T_last_lidar)
-        guess = last.T_odom_lidar @ T_last_lidar if odometry is None else odometry.T_odom_lidar
+        guess = se3.rigid(last.T_odom_lidar @ T_last_lidar) if odometry is None else odometry.T_odom_lidar
         registration = self._sweep_to_map(features, guess) or odometry
         if registration is None:
             return self._coast(last, features, guess, end_ns)
@@ -151,7 +151,7 @@ class LoamFrontEnd:
             huber_m=config.huber_m,
             min_eigenvalue=config.odometry_min_eigenvalue,
         )
-        return None if found is None else replace(found, T_odom_lidar=last.T_odom_lidar @ found.T_odom_lidar)
+        return None if found is None else replace(found, T_odom_lidar=se3.rigid(last.T_odom_lidar @ found.T_odom_lidar))
 
     def _sweep_to_map(self, features: LoamFeatures, guess: F64) -> _Registration | None:
         """Thinned less sharp and less flat points to the lines and planes of the map; None with too few matches."""

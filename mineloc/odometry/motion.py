@@ -66,7 +66,8 @@ def pose_deviation(T_now: F64, T_before: F64) -> F64:
 
 def add_to_pose(T: F64, error: F64) -> F64:
     """The pose with a (6,) [rotation (right), position (odom)] error applied."""
-    return se3.from_rt(T[:3, :3] @ exp_so3(np.ascontiguousarray(error[:3])), T[:3, 3] + error[3:6])
+    turned = T[:3, :3] @ exp_so3(np.ascontiguousarray(error[:3]))
+    return se3.rigid(se3.from_rt(turned, T[:3, 3] + error[3:6]))
 
 
 @njit(cache=True, nogil=True)

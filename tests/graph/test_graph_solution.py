@@ -237,3 +237,26 @@ def test_a_flight_of_5700_keyframes():
     assert causal < 2.5
     assert smoothed < causal
     assert solution.iterations < 60
+
+
+def test_a_chain_of_thousands_of_keyframes_stays_rigid_and_determined():
+    # motions that are rotations but for rounding: along a chain of products that grew until nothing was finite
+    rng = np.random.default_rng(0)
+    graph = PoseGraph(GraphConfig())
+    causal = CausalEstimate(graph)
+    almost = np.eye(4)
+    almost[:3, :3] += 1e-13 * rng.normal(size=(3, 3))
+    for k in range(1500):
+        keyframe = Keyframe(k, k * 10**9, np.eye(4), NO_POINTS, None)
+        if k == 0:
+            graph.add_first(keyframe)
+        else:
+            motion = se3.exp(np.r_[0.1 * rng.normal(size=3), 1.0, 0.0, 0.0]) @ almost
+            graph.add_next(keyframe, RelativePose(k - 1, k, motion, 1e4 * np.eye(6)))
+        newest = causal.update()
+    solution = solve(graph)
+    for poses in (newest[None], np.array(graph.initial), solution.poses):
+        rotations = poses[:, :3, :3]
+        assert np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max() < 1e-9
+    assert np.abs(solution.poses - graph.initial).max() < 1e-6
+    assert np.all(np.linalg.eigvalsh(solution.covariances) > 0)
