@@ -114,7 +114,6 @@ def _sweeps(what: SyntheticRun, stamps: np.ndarray, rng: np.random.Generator) ->
             "weak_x": np.where(weak, 1.0, np.nan),
             "weak_y": np.where(weak, 0.0, np.nan),
             "weak_z": np.where(weak, 0.0, np.nan),
-            "step_ms": 14.0 + rng.random(n),
         }
     )
 

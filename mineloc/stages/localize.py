@@ -124,7 +124,6 @@ def _sweeps(found: Localization) -> pl.DataFrame:
             "weak_x": weak[:, 0],
             "weak_y": weak[:, 1],
             "weak_z": weak[:, 2],
-            "step_ms": 1e3 * np.array(found.seconds["odometry"]),
         }
     )
 

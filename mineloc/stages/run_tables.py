@@ -28,7 +28,6 @@ SWEEPS = pl.Schema(
         "weak_x": pl.Float64(),
         "weak_y": pl.Float64(),
         "weak_z": pl.Float64(),
-        "step_ms": pl.Float64(),
     }
 )
 KEYFRAMES = pl.Schema(
