@@ -49,5 +49,13 @@ def _use_own_cache() -> None:
     numba.config.CACHE_DIR = str(folder)  # pyright: ignore[reportAttributeAccessIssue, reportPrivateImportUsage]
 
 
+def _prefer_openmp() -> None:
+    """open3d brings a TBB that is too old for numba, which would try it first and warn."""
+    if not os.environ.get("NUMBA_THREADING_LAYER_PRIORITY"):
+        layers = ["omp", "workqueue", "tbb"]
+        numba.config.THREADING_LAYER_PRIORITY = layers  # pyright: ignore[reportAttributeAccessIssue, reportPrivateImportUsage]
+
+
 _use_own_cache()
+_prefer_openmp()
 njit = numba.njit

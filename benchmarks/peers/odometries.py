@@ -246,7 +246,7 @@ class RkoLio:
     package = "rko_lio"
     pose_at = 1.0
 
-    def __init__(self, calibration: Calibration, *, voxel_size: float = 0.5, **options: Any) -> None:
+    def __init__(self, calibration: Calibration, *, voxel_size: float = 0.3, **options: Any) -> None:
         from rko_lio.config import LIOConfig
         from rko_lio.lio import LIO
 

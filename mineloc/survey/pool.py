@@ -151,6 +151,4 @@ def _cause(code: int) -> str:
 def _environment(workers: int) -> Mapping[str, str]:
     """The environment of a worker: each gets its share of the cores, unless the user said otherwise."""
     share = str(max(1, len(os.sched_getaffinity(0)) // workers))
-    # open3d brings a TBB that is too old for numba, which would say so on every start
-    layers = {"NUMBA_THREADING_LAYER_PRIORITY": "omp workqueue tbb"}
-    return {**dict.fromkeys(THREAD_VARIABLES, share), **layers, **os.environ}
+    return {**dict.fromkeys(THREAD_VARIABLES, share), **os.environ}
