@@ -1,17 +1,18 @@
 """Ingest against merely reading: the same file through `mineloc ingest` and through the mcap library with CRCs checked.
 
-    python benchmarks/ingest_speed.py                       makes its own recording (velodyne layout, IMU at 200 Hz)
-    python benchmarks/ingest_speed.py --sweeps 9700         one of 6 GB
+    python benchmarks/ingest_speed.py                       makes recordings (velodyne layout, IMU at 200 Hz)
+    python benchmarks/ingest_speed.py --sweeps 9700         of 6 GB
     python benchmarks/ingest_speed.py --recording FILE.mcap
-    python benchmarks/ingest_speed.py --again               the flight that ingest made, ingested once more
 
-Both sides run in turn, each in a process of its own, several times; the table gives medians and peak memory.
+Both sides run in turn, each in a process of its own, several times; the table gives medians and peak memory, and goes
+to results/.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import resource
 import statistics
 import subprocess
@@ -24,6 +25,9 @@ from pathlib import Path
 import numpy as np
 
 POINTS, RINGS, PERIOD_NS, IMU_STEP_NS = 28_800, 16, 100_000_000, 5_000_000
+HEAD = """\
+| file | MB | mcap read + CRC, MB/s | ingest, MB/s | ratio | ingest, peak MiB |
+| --- | ---: | ---: | ---: | ---: | ---: |"""
 START_NS = 1_790_000_000_000_000_000
 
 
@@ -120,44 +124,56 @@ def measure(side: str, path: Path, out: Path) -> dict[str, float]:
     return json.loads(subprocess.run(line, check=True, capture_output=True, text=True).stdout)
 
 
+def compare(what: str, path: Path, out: Path, repeats: int) -> str:
+    """A row of the table: both sides in turn, medians."""
+    runs = [(measure("read", path, out), measure("ingest", path, out)) for _ in range(repeats)]
+    megabytes = path.stat().st_size / 1e6
+    seconds = [statistics.median(run[side]["seconds"] for run in runs) for side in (0, 1)]
+    peak = max(run[1]["peak_mib"] for run in runs)
+    ratio = statistics.median(read["seconds"] / ingest["seconds"] for read, ingest in runs)
+    speeds = " | ".join(f"{megabytes / s:.0f}" for s in seconds)
+    row = f"| {what} | {megabytes:.0f} | {speeds} | {ratio:.2f} | {peak:.0f} |"
+    print(row, flush=True)
+    return row
+
+
+def compare_all(folder: Path, sweeps: int, repeats: int) -> list[str]:
+    """Every compression that rosbag2 writes, and a flight that ingest made."""
+    rows: list[str] = []
+    out = folder / "out.mcap"
+    for compression in ("lz4", "zstd", "none"):
+        path = folder / "recording.mcap"
+        make_recording(path, sweeps, compression)
+        rows.append(compare(f"recording, {compression}", path, out, repeats))
+    flight = out.rename(folder / "flight.mcap")
+    rows.append(compare("canonical flight", flight, out, repeats))
+    return rows
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--recording", type=Path)
-    parser.add_argument("--sweeps", type=int, default=1800, help="ten a second")
-    parser.add_argument("--compression", choices=["lz4", "zstd", "none"], default="lz4")
+    parser.add_argument("--recording", type=Path, help="measure this one, and write no results")
+    parser.add_argument("--sweeps", type=int, default=1800, help="of the recordings that are made; ten a second")
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--again", action="store_true", help="ingest the flight that ingest made")
     parser.add_argument("--folder", type=Path, help="where files are made; the system's temporary folder otherwise")
+    parser.add_argument("--results", type=Path, default=Path(__file__).parent / "results" / "ingest_speed.md")
     parser.add_argument("--out", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--child", choices=["read", "ingest"], help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.child:
         child(given.child, given.recording, given.out)
         return
-    with tempfile.TemporaryDirectory(dir=given.folder) as folder:
-        path = given.recording
-        if path is None:
-            path = Path(folder) / "recording.mcap"
-            make_recording(path, given.sweeps, given.compression)
-        if given.again:
-            flight = Path(folder) / "flight.mcap"
-            measure("ingest", path, flight)
-            path = flight
-        report(path, Path(folder) / "out.mcap", given.repeats)
-
-
-def report(path: Path, out: Path, repeats: int) -> None:
-    runs = [(measure("read", path, out), measure("ingest", path, out)) for _ in range(repeats)]
-    reads = [read["seconds"] for read, _ in runs]
-    ingests = [ingest["seconds"] for _, ingest in runs]
-    megabytes = path.stat().st_size / 1e6
-    print(f"{path.name}: {megabytes:.0f} MB, {repeats} runs, flight of {out.stat().st_size / 1e6:.0f} MB")
-    for name, seconds, side in (("mcap read + CRC", reads, 0), ("mineloc ingest", ingests, 1)):
-        median = statistics.median(seconds)
-        peak = max(run[side]["peak_mib"] for run in runs)
-        print(f"{name:16} {median:7.3f} s  {megabytes / median:7.0f} MB/s  peak {peak:5.0f} MiB")
-    ratios = [read / ingest for read, ingest in zip(reads, ingests, strict=True)]
-    print(f"speed of ingest / speed of reading: {statistics.median(ratios):.2f} (wanted: at least 0.60)")
+    load = "load {:.1f} {:.1f} {:.1f}".format(*os.getloadavg())
+    print(HEAD)
+    with tempfile.TemporaryDirectory(dir=given.folder) as name:
+        if given.recording is not None:
+            compare(given.recording.name, given.recording, Path(name) / "out.mcap", given.repeats)
+            return
+        rows = compare_all(Path(name), given.sweeps, given.repeats)
+    command = f"python benchmarks/ingest_speed.py --sweeps {given.sweeps} --repeats {given.repeats}"
+    about = f"`{command}`, {load} when started, {os.cpu_count()} cores; medians; asked: a ratio of 0.60."
+    given.results.parent.mkdir(parents=True, exist_ok=True)
+    given.results.write_text("\n".join(["# Ingest against reading", "", about, "", HEAD, *rows, ""]))
 
 
 if __name__ == "__main__":
