@@ -99,34 +99,38 @@ def read_only(path: Path) -> int:
         return sum(1 for _ in make_reader(stream, validate_crcs=True).iter_messages())
 
 
-def child(side: str, path: Path, out: Path) -> None:
-    """One measurement in this process, printed as JSON; imports and a first compilation are not counted."""
-    work: Callable[[], object]
+def child(side: str, path: Path, out: Path, warm_up: Path) -> None:
+    """One measurement in this process, printed as JSON; a small recording before it takes imports and compilation."""
+    work: Callable[[Path], object]
     if side == "read":
-        import mcap.reader  # noqa: F401
-
-        work = lambda: read_only(path)  # noqa: E731
+        work = read_only
     else:
         from mineloc.stages.ingest import ingest
 
-        work = lambda: ingest(path, out=out)  # noqa: E731
+        def work(recording: Path) -> object:
+            out.unlink(missing_ok=True)
+            return ingest(recording, out=out)
+
+    work(warm_up)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     start = time.perf_counter()
-    work()
+    work(path)
     seconds = time.perf_counter() - start
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     sys.stdout.write(json.dumps({"seconds": seconds, "peak_mib": peak / 1024, "imports_mib": before / 1024}))
 
 
-def measure(side: str, path: Path, out: Path) -> dict[str, float]:
-    out.unlink(missing_ok=True)
+def measure(side: str, path: Path, out: Path, warm_up: Path) -> dict[str, float]:
     line = [sys.executable, __file__, "--child", side, "--recording", str(path), "--out", str(out)]
+    line += ["--warm-up", str(warm_up)]
     return json.loads(subprocess.run(line, check=True, capture_output=True, text=True).stdout)
 
 
 def compare(what: str, path: Path, out: Path, repeats: int) -> str:
     """A row of the table: both sides in turn, medians."""
-    runs = [(measure("read", path, out), measure("ingest", path, out)) for _ in range(repeats)]
+    warm_up = out.with_name("warm_up.mcap")
+    make_recording(warm_up, 60, "lz4")
+    runs = [tuple(measure(side, path, out, warm_up) for side in ("read", "ingest")) for _ in range(repeats)]
     megabytes = path.stat().st_size / 1e6
     seconds = [statistics.median(run[side]["seconds"] for run in runs) for side in (0, 1)]
     peak = max(run[1]["peak_mib"] for run in runs)
@@ -158,10 +162,11 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="where files are made; the system's temporary folder otherwise")
     parser.add_argument("--results", type=Path, default=Path(__file__).parent / "results" / "ingest_speed.md")
     parser.add_argument("--out", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--warm-up", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--child", choices=["read", "ingest"], help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.child:
-        child(given.child, given.recording, given.out)
+        child(given.child, given.recording, given.out, given.warm_up)
         return
     load = "load {:.1f} {:.1f} {:.1f}".format(*os.getloadavg())
     print(HEAD)

@@ -1,0 +1,53 @@
+"""Where flights come from."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from mineloc.config.section import Section
+
+
+class IngestConfig(Section):
+    """How a recording becomes a canonical flight."""
+
+    compression: Literal["zstd", "lz4", "none"] = "lz4"
+    chunk_bytes: int = Field(
+        default=1 << 20, ge=1 << 14, le=1 << 20, description="uncompressed size of a chunk, at most 1 MiB"
+    )
+    gap_factor: float = Field(default=1.8, gt=1, description="a pause longer than this many periods is a gap")
+
+
+class SimulateConfig(Section):
+    """A flight that never took place: tour, drone, sensors and their errors."""
+
+    length_m: float = Field(default=1000.0, gt=0, description="path length of the flight")
+    speed_mps: float = Field(default=2.5, gt=0, le=15, description="on straight roadways; slower in bends")
+    accel_mps2: float = Field(default=1.5, gt=0, le=10)
+    yaw_rate_degps: float = Field(default=60.0, gt=0, le=360)
+    hover_s: float = Field(default=4.0, ge=1, description="at rest before the start and after the end")
+    clearance_m: float = Field(default=0.7, gt=0, description="wanted distance to walls; half of it is the least")
+    sway_m: float = Field(default=0.15, ge=0, description="standard deviation of the wander off the line")
+    vibration_mps2: float = Field(default=0.5, ge=0, description="root mean square an axis")
+    vibration_degps: float = Field(default=1.5, ge=0, description="root mean square an axis")
+    seed: int = Field(default=0, ge=0)
+    sensor: Literal["vlp16", "rs16", "hdl32e", "os0"] = "vlp16"
+    lidar_hz: float = Field(default=10.0, ge=2, le=20, description="revolutions a second")
+    grazing_noise: float = Field(
+        default=0.0009, ge=0, description="growth of the range noise: metres a metre and tan(incidence)"
+    )
+    loss: float = Field(default=0.005, ge=0, lt=1, description="share of shots lost by chance")
+    dust: float = Field(default=0.0, ge=0, lt=1, description="share of shots that would meet dust in open space")
+    dust_depth_m: float = Field(default=1.5, gt=0, description="mean depth at which dust returns")
+    sweep_loss: float = Field(default=0.0, ge=0, lt=1, description="share of sweeps missing, in runs of three")
+    machine: bool = Field(default=False, description="a loader drives ahead of the drone")
+    roadway_width_m: float = Field(default=4.0, ge=1.5, le=30, description="of plans that do not tell (DXF)")
+    roadway_height_m: float = Field(default=3.2, ge=1.8, le=30, description="of plans that do not tell (DXF)")
+    imu_hz: float = Field(default=200.0, ge=50, le=1000)
+    gyro_noise_degps_rthz: float = Field(default=0.007, ge=0)
+    gyro_bias_degps: float = Field(default=0.2, ge=0)
+    gyro_walk_degps2_rthz: float = Field(default=0.0005, ge=0)
+    accel_noise_mps2_rthz: float = Field(default=0.002, ge=0)
+    accel_bias_mps2: float = Field(default=0.03, ge=0)
+    accel_walk_mps3_rthz: float = Field(default=0.0002, ge=0)
