@@ -31,8 +31,8 @@ class OdometryConfig(Section):
     coarse_voxel_m: float = Field(
         default=0.9, ge=0.1, description="edge of the patches that stand in for poor fine ones"
     )
-    sweep_voxel_m: float = Field(default=0.3, gt=0, description="one mean point a voxel is registered")
-    insert_voxel_m: float = Field(default=0.1, gt=0, description="one mean point a voxel goes into the map")
+    sweep_voxel_m: float = Field(default=0.4, gt=0, description="one mean point a voxel is registered")
+    insert_voxel_m: float = Field(default=0.15, gt=0, description="one mean point a voxel goes into the map")
     patch_points: float = Field(default=200.0, ge=10, description="weight that a fine patch keeps; older points fade")
     patch_min_points: float = Field(default=5.0, ge=3)
     patch_growth: float = Field(default=0.2, ge=0, description="share of new points that makes a patch fitted again")

@@ -88,4 +88,8 @@ def edge_information(
 
 def _translation_block(hessian: F64) -> F64:
     rotation, cross, translation = hessian[:3, :3], hessian[:3, 3:], hessian[3:, 3:]
-    return translation - cross.T @ np.linalg.pinv(rotation, hermitian=True) @ cross
+    # the pseudo-inverse: what no point turns says nothing
+    values, vectors = np.linalg.eigh(rotation)
+    known = values > 1e-12 * max(float(values[-1]), 0.0)
+    half = vectors[:, known].T @ cross / np.sqrt(values[known])[:, None]
+    return translation - half.T @ half

@@ -9,27 +9,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from mineloc import se3
 from mineloc.config import KeyframeConfig, OdometryConfig
-from mineloc.data import F32, F64, Calibration, Degeneracy, ImuSamples, Keyframe, OdometryStep, RelativePose, Sweep
+from mineloc.data import F64, Calibration, Degeneracy, ImuSamples, Keyframe, OdometryStep, RelativePose, Sweep
 from mineloc.errors import FlightError
 from mineloc.odometry.information import EdgeNoise, degeneracy_of, edge_information
 from mineloc.odometry.keyframes import KeyframeSelector
 from mineloc.odometry.model_choice import ModelChoice
 from mineloc.odometry.motion import BodyPath, MotionModel
 from mineloc.odometry.registration import Linearised, Thinned, Weighting, linearise
-from mineloc.odometry.voxel_map import VoxelMap
+from mineloc.odometry.voxel_map import VoxelMap, insert_into_both
 from mineloc.sweep.deskew import transform_between_knots
-from mineloc.sweep.voxel_grid import mean_by_label, number_voxels, voxel_centroids
+from mineloc.sweep.voxel_grid import VoxelMeans, voxel_means
 
 FORGET_EVERY = 100
 _CONVERGED_RAD, _CONVERGED_M = 2e-5, 2e-4
 LOST_SWEEPS = 10
 """After so many sweeps that the map does not hold, the motion model begins anew."""
-_SHIFT_M = 0.001
-"""A sweep that was deskewed better than this is not deskewed again."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,12 +47,6 @@ class _Registered:
 def _twist(motion: MotionModel) -> F64:
     """(6,) [rate (body), velocity (odom)] of the state that the prediction did not have."""
     return (motion.measured @ motion.deviation())[6:]
-
-
-def _shift_m(twist: F64, sweep: Sweep) -> float:
-    """How far a twist moves a point at 10 m within a sweep."""
-    span_s = 1e-9 * (sweep.end_ns - sweep.stamp_ns)
-    return span_s * float(np.linalg.norm(twist[3:]) + 10.0 * np.linalg.norm(twist[:3]))
 
 
 class MinelocFrontEnd:
@@ -89,11 +80,9 @@ class MinelocFrontEnd:
         motion = self._model(sweep, imu)
         before = motion.stamp_ns, motion.T_odom_body
         path = motion.predict(sweep.stamp_ns, sweep.end_ns)
-        cloud = self._deskewed(sweep, path, np.zeros(6))
-        registered = self._register(motion, sweep, cloud)
-        twist = _twist(motion)
-        if _shift_m(twist, sweep) > _SHIFT_M:
-            cloud = self._deskewed(sweep, path, twist)
+        cloud = self._thinned(sweep, path)
+        registered = self._register(motion, cloud)
+        cloud = self._deskewed_further(cloud, motion)
         reason = self._doubt(registered)
         self._coasted_s += (motion.stamp_ns - before[0]) * 1e-9 if reason else 0.0
         self._lost_sweeps = self._lost_sweeps + 1 if reason and registered.points else 0
@@ -118,28 +107,28 @@ class MinelocFrontEnd:
             self._maps, self._lost_sweeps = self._new_maps(), 0
         return self._choice.begin(sweep, imu)
 
-    def _deskewed(self, sweep: Sweep, path: BodyPath, twist: F64) -> F32:
-        """(n, 3) lidar points as if all were measured at the sweep's end, by a path and a twist on top of it."""
-        tau = 1e-9 * (path.stamps_ns - path.stamps_ns[-1])[:, None]
-        turns = Rotation.from_rotvec(tau * twist[:3]).as_matrix()
-        more = se3.from_rt(turns, tau * (path.poses[-1, :3, :3].T @ twist[3:]))
-        T_end_body = more @ se3.inverse(path.poses[-1]) @ path.poses
-        T_end_lidar = se3.inverse(self._choice.T_body_lidar) @ T_end_body @ self._choice.T_body_lidar
-        offsets_ns = np.zeros(len(sweep), np.int64) if sweep.offsets_ns is None else sweep.offsets_ns
+    def _thinned(self, sweep: Sweep, path: BodyPath) -> VoxelMeans:
+        """Points in lidar axes as if all were measured at the sweep's end by that path, one a voxel of the map."""
+        n = len(sweep)
+        T_end_lidar = se3.inverse(path.poses[-1] @ self._choice.T_body_lidar) @ path.poses @ self._choice.T_body_lidar
+        offsets_ns = np.zeros(n, np.int64) if sweep.offsets_ns is None else sweep.offsets_ns
         knots_ns, rows = path.stamps_ns - sweep.stamp_ns, np.ascontiguousarray(T_end_lidar[:, :3])
-        return transform_between_knots(sweep.points_lidar, offsets_ns, knots_ns, rows)
+        points = transform_between_knots(sweep.points_lidar, offsets_ns, knots_ns, rows)
+        times_s = 1e-9 * (offsets_ns - offsets_ns.max(initial=0))
+        return voxel_means(points, times_s, np.ones(n), self._config.insert_voxel_m, ring=sweep.ring)
 
-    def _thinned(self, sweep: Sweep, cloud: F32) -> Thinned:
-        _, label, count = number_voxels(cloud, 1.0 / self._config.sweep_voxel_m)
-        ranges = np.bincount(label, minlength=count).astype(np.float64)
-        times_s = np.zeros(count)
-        if sweep.offsets_ns is not None and count:
-            times_s = np.bincount(label, 1e-9 * (sweep.offsets_ns - sweep.offsets_ns.max()), count) / ranges
-        return Thinned(se3.apply(self._choice.T_body_lidar, mean_by_label(cloud, label, count)), times_s, ranges)
+    def _deskewed_further(self, cloud: VoxelMeans, motion: MotionModel) -> VoxelMeans:
+        """The points once more, by the motion that registration added to the prediction; to first order."""
+        twist, T_body_lidar = _twist(motion), self._choice.T_body_lidar
+        rate, velocity = twist[:3], motion.T_odom_body[:3, :3].T @ twist[3:]
+        turn = T_body_lidar[:3, :3].T
+        shift = cloud.points @ se3.hat(turn @ rate).T + turn @ (velocity + np.cross(rate, T_body_lidar[:3, 3]))
+        return cloud._replace(points=cloud.points + cloud.times_s[:, None] * shift)
 
-    def _register(self, motion: MotionModel, sweep: Sweep, cloud: F32) -> _Registered:
+    def _register(self, motion: MotionModel, cloud: VoxelMeans) -> _Registered:
         """Gauss-Newton on prior and residuals together; without a map or points the prediction stands."""
-        thinned = self._thinned(sweep, cloud)
+        few = voxel_means(*cloud, self._config.sweep_voxel_m)
+        thinned = Thinned(se3.apply(self._choice.T_body_lidar, few.points), few.times_s, few.weights)
         count = len(thinned.ranges)
         if not len(self._maps[0]) or not count:
             return _Registered(None, np.zeros((6, 6)), count)
@@ -180,26 +169,24 @@ class MinelocFrontEnd:
             return f"inlier ratio {registered.inlier_ratio:.2f}, at least {c.min_inlier_ratio} needed"
         return ""
 
-    def _grow_map(self, cloud: F32) -> None:
-        if len(cloud):
-            thin = voxel_centroids(cloud, self._config.insert_voxel_m)
-            points = se3.apply(self._choice.T_odom_lidar, thin)
-            for patches in self._maps:
-                patches.insert(points, now=self._flown_m)
+    def _grow_map(self, cloud: VoxelMeans) -> None:
+        if len(cloud.points):
+            points = se3.apply(self._choice.T_odom_lidar, cloud.points)
+            insert_into_both(self._maps, points, now=self._flown_m)
         self._sweeps += 1
         if self._sweeps % FORGET_EVERY == 0:
             for patches in self._maps:
                 patches.forget(self._flown_m - self._config.forget_after_m)
 
-    def _told(self, stamp_ns: int, cloud: F32, registered: _Registered, reason: str) -> OdometryStep:
+    def _told(self, stamp_ns: int, cloud: VoxelMeans, registered: _Registered, reason: str) -> OdometryStep:
         T_odom_lidar = self._choice.T_told_lidar
         last = registered.last
         degeneracy = None
         if last is not None:
             degeneracy = degeneracy_of(registered.hessian_lidar, registered.matches, weak_ratio=self._config.weak_ratio)
         keyframe, edge = None, None
-        if len(cloud) and self._selector.consider(stamp_ns, T_odom_lidar):
-            points = voxel_centroids(cloud, self._keyframe_config.voxel_m)
+        if len(cloud.points) and self._selector.consider(stamp_ns, T_odom_lidar):
+            points = voxel_means(*cloud, self._keyframe_config.voxel_m).points.astype(np.float32)
             keyframe = Keyframe(self._selector.index, stamp_ns, T_odom_lidar, points, self._choice.up_lidar)
             edge = self._edge(registered, degeneracy)
             self._coasted_s = 0.0

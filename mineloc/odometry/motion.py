@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from mineloc import se3
 from mineloc.compiled import njit
@@ -60,14 +59,26 @@ class MotionModel(Protocol):
 
 def pose_deviation(T_now: F64, T_before: F64) -> F64:
     """(6,) [rotation, position] error that takes one pose to another in the filters' convention."""
-    rotation = Rotation.from_matrix(T_before[:3, :3].T @ T_now[:3, :3]).as_rotvec()
-    return np.concatenate([rotation, T_now[:3, 3] - T_before[:3, 3]])
+    out = np.empty(6)
+    _log_so3(T_before[:3, :3].T @ T_now[:3, :3], out)
+    out[3:] = T_now[:3, 3] - T_before[:3, 3]
+    return out
 
 
 def add_to_pose(T: F64, error: F64) -> F64:
     """The pose with a (6,) [rotation (right), position (odom)] error applied."""
     turned = T[:3, :3] @ exp_so3(np.ascontiguousarray(error[:3]))
     return se3.rigid(se3.from_rt(turned, T[:3, 3] + error[3:6]))
+
+
+@njit(cache=True, nogil=True)
+def _log_so3(R: F64, out: F64) -> None:
+    """Rotation vector of a (3, 3) rotation into `out`; exact but for half turns, which no correction is."""
+    x, y, z = 0.5 * (R[2, 1] - R[1, 2]), 0.5 * (R[0, 2] - R[2, 0]), 0.5 * (R[1, 0] - R[0, 1])
+    sine = np.sqrt(x * x + y * y + z * z)
+    cosine = 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
+    scale = 1.0 if sine < 1e-12 else np.arctan2(sine, cosine) / sine
+    out[0], out[1], out[2] = scale * x, scale * y, scale * z
 
 
 @njit(cache=True, nogil=True)

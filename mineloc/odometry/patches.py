@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mineloc.compiled import njit
+from mineloc.compiled import njit, prange
 from mineloc.data import F32, F64, I64
 
 I32 = NDArray[np.int32]
@@ -205,6 +205,36 @@ def fit_patches(arrays: PatchArrays, touched: I32, min_weight: float, growth: fl
             fits[row, LAMBDA + k] = max(a[k, k], 0.0)
         fits[row, COUNT] = n
         fresh[row] = 0.0
+
+
+class Insertion(NamedTuple):
+    """A map that takes points, and how; see `insert_points` and `fit_patches`."""
+
+    arrays: PatchArrays
+    touched: I32
+    used: int
+    voxel_m: float
+    cap: float
+    min_weight: float
+    growth: float
+
+
+@njit(cache=True, nogil=True)
+def insert_and_fit(points: F64, now: float, how: Insertion) -> int:
+    """Add points and fit what they changed; returns the rows in use."""
+    used, hits = insert_points(points, how.arrays, how.used, how.voxel_m, now, how.cap, how.touched)
+    fit_patches(how.arrays, how.touched[:hits], how.min_weight, how.growth)
+    return used
+
+
+@njit(cache=True, parallel=True)
+def insert_and_fit_both(points: F64, now: float, one: Insertion, two: Insertion, used: I64) -> None:
+    """`insert_and_fit` for two maps, side by side; their rows in use go into `used`."""
+    for which in prange(2):
+        if which == 0:
+            used[0] = insert_and_fit(points, now, one)
+        else:
+            used[1] = insert_and_fit(points, now, two)
 
 
 @njit(cache=True)

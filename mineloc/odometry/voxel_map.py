@@ -9,7 +9,16 @@ from __future__ import annotations
 import numpy as np
 
 from mineloc.data import F64, I64
-from mineloc.odometry.patches import COUNT, FIT_COLUMNS, MEAN, allocate, fit_patches, insert_points, reinsert
+from mineloc.odometry.patches import (
+    COUNT,
+    FIT_COLUMNS,
+    MEAN,
+    Insertion,
+    allocate,
+    insert_and_fit,
+    insert_and_fit_both,
+    reinsert,
+)
 
 
 class VoxelMap:
@@ -34,11 +43,20 @@ class VoxelMap:
 
     def insert(self, points: F64, *, now: float) -> None:
         """Add (n, 3) points; `now` is any number that never falls, for `forget`."""
-        self._make_room(len(points))
-        if len(self._touched) < len(points):
-            self._touched = np.zeros(2 * len(points), np.int32)
-        self._used, hits = insert_points(points, self.arrays, self._used, self.voxel_m, now, self._cap, self._touched)
-        fit_patches(self.arrays, self._touched[:hits], self._min_weight, self._growth)
+        self.inserted(insert_and_fit(points, now, self.insertion(len(points))))
+
+    def insertion(self, n: int) -> Insertion:
+        """What a kernel needs to add n points, for which room is made."""
+        self._make_room(n)
+        if len(self._touched) < n:
+            self._touched = np.zeros(2 * n, np.int32)
+        return Insertion(
+            self.arrays, self._touched, self._used, self.voxel_m, self._cap, self._min_weight, self._growth
+        )
+
+    def inserted(self, used: int) -> None:
+        """The kernel has left so many rows in use."""
+        self._used = used
 
     def forget(self, before: float) -> None:
         """Drop the patches last hit before `before`."""
@@ -60,6 +78,14 @@ class VoxelMap:
         index = np.floor(new.centres[:m] / self.voxel_m).astype(np.int64)
         reinsert(index, new.keys, new.rows)
         self.arrays, self._used = new, m
+
+
+def insert_into_both(maps: tuple[VoxelMap, VoxelMap], points: F64, *, now: float) -> None:
+    """`insert` into two maps at the same time."""
+    used = np.zeros(2, np.int64)
+    insert_and_fit_both(points, now, maps[0].insertion(len(points)), maps[1].insertion(len(points)), used)
+    for patches, rows in zip(maps, used, strict=True):
+        patches.inserted(int(rows))
 
 
 def fits_at_plainly(patches: VoxelMap, places: F64) -> F64:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from mineloc.compiled import njit
 from mineloc.config import SweepConfig
-from mineloc.data import Sweep
+from mineloc.data import F32, I64, Sweep
 
 
 def within_range(sweep: Sweep, config: SweepConfig) -> Sweep:
@@ -20,6 +21,18 @@ def within_range(sweep: Sweep, config: SweepConfig) -> Sweep:
     """
     if not config.min_range_m < config.max_range_m:
         raise ValueError(f"min_range_m {config.min_range_m} must be below max_range_m {config.max_range_m}")
-    x, y, z = sweep.points_lidar.astype(np.float64).T
-    range2 = x * x + y * y + z * z
-    return sweep.keep((range2 >= config.min_range_m**2) & (range2 <= config.max_range_m**2))
+    kept, count = _between(sweep.points_lidar, config.min_range_m**2, config.max_range_m**2)
+    return sweep if count == len(sweep) else sweep.keep(kept[:count])
+
+
+@njit(cache=True, nogil=True)
+def _between(points: F32, least_m2: float, most_m2: float) -> tuple[I64, int]:
+    """Indices of the points whose squared range lies between, and how many they are."""
+    kept = np.empty(len(points), np.int64)
+    count = 0
+    for i in range(len(points)):
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        if least_m2 <= x * x + y * y + z * z <= most_m2:
+            kept[count] = i
+            count += 1
+    return kept, count
