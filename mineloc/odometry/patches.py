@@ -208,10 +208,8 @@ def fit_patches(arrays: PatchArrays, touched: I32, min_weight: float, growth: fl
 
 
 class Insertion(NamedTuple):
-    """A map that takes points, and how; see `insert_points` and `fit_patches`."""
+    """How a map takes points; see `insert_points` and `fit_patches`."""
 
-    arrays: PatchArrays
-    touched: I32
     used: int
     voxel_m: float
     cap: float
@@ -220,21 +218,25 @@ class Insertion(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def insert_and_fit(points: F64, now: float, how: Insertion) -> int:
+def insert_and_fit(points: F64, now: float, arrays: PatchArrays, touched: I32, how: Insertion) -> int:
     """Add points and fit what they changed; returns the rows in use."""
-    used, hits = insert_points(points, how.arrays, how.used, how.voxel_m, now, how.cap, how.touched)
-    fit_patches(how.arrays, how.touched[:hits], how.min_weight, how.growth)
+    used, hits = insert_points(points, arrays, how.used, how.voxel_m, now, how.cap, touched)
+    fit_patches(arrays, touched[:hits], how.min_weight, how.growth)
     return used
 
 
 @njit(cache=True, parallel=True)
-def insert_and_fit_both(points: F64, now: float, one: Insertion, two: Insertion, used: I64) -> None:
+def insert_and_fit_both(
+    points: F64, now: float,
+    one: PatchArrays, touched_one: I32, how_one: Insertion,
+    two: PatchArrays, touched_two: I32, how_two: Insertion, used: I64,
+) -> None:  # fmt: skip
     """`insert_and_fit` for two maps, side by side; their rows in use go into `used`."""
     for which in prange(2):
         if which == 0:
-            used[0] = insert_and_fit(points, now, one)
+            used[0] = insert_and_fit(points, now, one, touched_one, how_one)
         else:
-            used[1] = insert_and_fit(points, now, two)
+            used[1] = insert_and_fit(points, now, two, touched_two, how_two)
 
 
 @njit(cache=True)

@@ -12,8 +12,10 @@ from mineloc.data import F64, I64
 from mineloc.odometry.patches import (
     COUNT,
     FIT_COLUMNS,
+    I32,
     MEAN,
     Insertion,
+    PatchArrays,
     allocate,
     insert_and_fit,
     insert_and_fit_both,
@@ -43,16 +45,15 @@ class VoxelMap:
 
     def insert(self, points: F64, *, now: float) -> None:
         """Add (n, 3) points; `now` is any number that never falls, for `forget`."""
-        self.inserted(insert_and_fit(points, now, self.insertion(len(points))))
+        self.inserted(insert_and_fit(points, now, *self.insertion(len(points))))
 
-    def insertion(self, n: int) -> Insertion:
+    def insertion(self, n: int) -> tuple[PatchArrays, I32, Insertion]:
         """What a kernel needs to add n points, for which room is made."""
         self._make_room(n)
         if len(self._touched) < n:
             self._touched = np.zeros(2 * n, np.int32)
-        return Insertion(
-            self.arrays, self._touched, self._used, self.voxel_m, self._cap, self._min_weight, self._growth
-        )
+        how = Insertion(self._used, self.voxel_m, self._cap, self._min_weight, self._growth)
+        return self.arrays, self._touched, how
 
     def inserted(self, used: int) -> None:
         """The kernel has left so many rows in use."""
@@ -83,7 +84,8 @@ class VoxelMap:
 def insert_into_both(maps: tuple[VoxelMap, VoxelMap], points: F64, *, now: float) -> None:
     """`insert` into two maps at the same time."""
     used = np.zeros(2, np.int64)
-    insert_and_fit_both(points, now, maps[0].insertion(len(points)), maps[1].insertion(len(points)), used)
+    one, two = (patches.insertion(len(points)) for patches in maps)
+    insert_and_fit_both(points, now, *one, *two, used)
     for patches, rows in zip(maps, used, strict=True):
         patches.inserted(int(rows))
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from mineloc.data import F64
 from mineloc.odometry.patches import COUNT, LAMBDA, MAJOR, MEAN, NORMAL, eigen_symmetric, find, patches_plainly
-from mineloc.odometry.voxel_map import VoxelMap, fits_at_plainly
+from mineloc.odometry.voxel_map import VoxelMap, fits_at_plainly, insert_into_both
 
 EVERYTHING = {"cap": 1e9, "min_weight": 1.0, "growth": 0.0}
 
@@ -112,6 +112,22 @@ def test_growing_loses_no_voxel(seed: int, sizes: list[int]) -> None:
     assert len(patches) == len(plain.cells)
     assert all(row_of(patches, tuple(cell)) >= 0 for cell in plain.cells.tolist())
     assert patches.arrays.sums[: len(patches), 0].sum() == sum(sizes)
+
+
+@settings(deadline=None, max_examples=10)
+@given(seed=st.integers(0, 10_000), sizes=st.lists(st.integers(0, 4000), min_size=1, max_size=4))
+def test_two_maps_at_once_become_what_each_becomes_alone(seed: int, sizes: list[int]) -> None:
+    rng = np.random.default_rng(seed)
+    together, alone = ((VoxelMap(0.3), VoxelMap(0.9)) for _ in range(2))
+    for now, n in enumerate(sizes):
+        points = rng.uniform(-5, 5, (n, 3))
+        insert_into_both(together, points, now=float(now))
+        for patches in alone:
+            patches.insert(points, now=float(now))
+    places = rng.uniform(-5, 5, (500, 3))
+    for one, other in zip(together, alone, strict=True):
+        assert len(one) == len(other)
+        assert np.array_equal(fits_at_plainly(one, places), fits_at_plainly(other, places))
 
 
 def test_forgetting_drops_what_was_not_seen_and_keeps_the_rest() -> None:
