@@ -165,6 +165,7 @@ def command(given: argparse.Namespace) -> str:
     words += ["--systems", given.systems] if given.names != list(SYSTEMS) else []
     words += ["--sweeps", str(given.sweeps)] if given.sweeps else []
     words += ["--cores", str(given.cores)] if given.cores != CORES else []
+    words += ["--resume"] if given.resume else []
     return shlex.join(words)
 
 
