@@ -135,10 +135,14 @@ class MinelocFrontEnd:
         predicted, A = motion.covariance, motion.measured
         prior = np.asarray(np.linalg.inv(predicted), dtype=np.float64)
         share, rounds = self._config.information_share, self._config.rounds
+        left_open: F64 | None = None  # where planes stand changes little from round to round
         while True:
             last = linearise(thinned, motion.T_odom_body, _twist(motion), self._maps, self._weighting)
-            information = prior + share * A.T @ last.H @ A
-            gradient = prior @ motion.deviation() + share * A.T @ last.b
+            if left_open is None:
+                left_open = last.left_open(self._config.weak_ratio)
+            H, b = last.held(left_open)
+            information = prior + share * A.T @ H @ A
+            gradient = prior @ motion.deviation() + share * A.T @ b
             error = -np.asarray(np.linalg.solve(information, gradient), dtype=np.float64)
             motion.add(error)
             rounds -= 1
@@ -146,8 +150,8 @@ class MinelocFrontEnd:
                 break
         motion.covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
         twist_prior = np.linalg.inv(A[6:] @ predicted @ A[6:].T) / share
-        H = last.H[:6, :6] - last.H[:6, 6:] @ np.linalg.solve(last.H[6:, 6:] + twist_prior, last.H[6:, :6])
-        return _Registered(last, self._in_lidar(H, motion.T_odom_body), count)
+        still = H[:6, :6] - H[:6, 6:] @ np.linalg.solve(H[6:, 6:] + twist_prior, H[6:, :6])
+        return _Registered(last, self._in_lidar(still, motion.T_odom_body), count)
 
     def _in_lidar(self, H: F64, T_odom_body: F64) -> F64:
         """The Hessian of [rotation (body), position (odom)] as one of a right perturbation of the lidar pose."""

@@ -17,6 +17,7 @@ from mineloc import se3
 from mineloc.compiled import njit, prange
 from mineloc.config import OdometryConfig
 from mineloc.data import F32, F64, Bool
+from mineloc.odometry.information import degeneracy_of
 from mineloc.odometry.patches import COUNT, LAMBDA, MAJOR, MEAN, NORMAL, PatchArrays, find
 from mineloc.odometry.voxel_map import VoxelMap, fits_at_plainly
 
@@ -70,22 +71,64 @@ class Thinned(NamedTuple):
     ranges: F64
 
 
-class Linearised(NamedTuple):
-    """The normal equations `H δ = -b` of one round.
+class Equations(NamedTuple):
+    """Normal equations `H δ = -b`, weighted by inverse variances, robust weights included.
 
     Attributes:
         H: (12, 12) of [rotation (body), position (odom), rate (body), velocity (odom)].
-        b: (12,). Both weighted by inverse variances, robust weights included.
-        planar, other, rejected: residuals to planes, to points, and beyond the gate.
-        residual_m: root mean square distance from the planes.
+        b: (12,).
     """
 
     H: F64
     b: F64
+
+
+class Linearised(NamedTuple):
+    """One round.
+
+    Attributes:
+        planes, points: what the residuals to planes and to points say.
+        planar, other, rejected: residuals to planes, to points, and beyond the gate.
+        residual_m: root mean square distance from the planes.
+    """
+
+    planes: Equations
+    points: Equations
     planar: int
     other: int
     rejected: int
     residual_m: float
+
+    @property
+    def H(self) -> F64:
+        """(12, 12) of both."""
+        return self.planes.H + self.points.H
+
+    @property
+    def b(self) -> F64:
+        """(12,) of both."""
+        return self.planes.b + self.points.b
+
+    def left_open(self, weak_ratio: float) -> F64:
+        """(k, 3) directions in odom along which the planes hold next to nothing; see `degeneracy_of`.
+
+        None where there is no plane at all: then the points are all there is.
+        """
+        weak = degeneracy_of(self.planes.H[:6, :6], self.planar, weak_ratio=weak_ratio).weak_directions
+        return weak if len(weak) < 3 else weak[:0]
+
+    def held(self, left_open: F64) -> Equations:
+        """Both, but points are silent along `left_open`, (k, 3) unit vectors.
+
+        The points of a map travel with the sensor: along a smooth roadway they pretend to hold what nothing holds, and
+        the way flown is lost without a word (METHOD 7.1).
+        """
+        if not len(left_open):
+            return Equations(self.H, self.b)
+        keep = np.eye(12)
+        keep[3:6, 3:6] -= left_open.T @ left_open
+        keep[9:, 9:] = keep[3:6, 3:6]
+        return Equations(self.planes.H + keep @ self.points.H @ keep, self.planes.b + keep @ self.points.b)
 
 
 def linearise(
@@ -107,15 +150,25 @@ def linearise(
     """
     fine, coarse = maps
     # upper triangles of Σ w J Jᵀ, Σ w τ J Jᵀ, Σ w τ² J Jᵀ: a point's motion counts τ times its place
-    Hs, bs, tallies = np.zeros((CHUNKS, 3, 6, 6)), np.zeros((CHUNKS, 2, 6)), np.zeros((CHUNKS, _TALLIES))
+    # planes and points apart
+    Hs, bs, tallies = np.zeros((CHUNKS, 2, 3, 6, 6)), np.zeros((CHUNKS, 2, 2, 6)), np.zeros((CHUNKS, _TALLIES))
     T, twist = np.ascontiguousarray(T_odom_body), np.ascontiguousarray(twist)
     _linearise(sweep, T, twist, fine.arrays, fine.voxel_m, coarse.arrays, coarse.voxel_m, w, Hs, bs, tallies)
-    upper, b, tally = Hs.sum(axis=0), bs.sum(axis=0), tallies.sum(axis=0)
-    place, mixed, motion = upper + np.swapaxes(np.triu(upper, 1), 1, 2)
-    H = np.block([[place, mixed], [mixed, motion]])
+    planes, points = (
+        Equations(_whole(upper), b.reshape(12)) for upper, b in zip(Hs.sum(axis=0), bs.sum(axis=0), strict=True)
+    )
+    tally = tallies.sum(axis=0)
     planar = int(tally[_PLANAR])
     rms = float(np.sqrt(tally[_SQUARES] / planar)) if planar else float("nan")
-    return Linearised(H, b.reshape(12), planar, int(tally[_OTHER]), int(tally[_REJECTED]), rms)
+    return Linearised(planes, points, planar, int(tally[_OTHER]), int(tally[_REJECTED]), rms)
+
+
+def _whole(upper: F64) -> F64:
+    """(12, 12) from the three (6, 6) sums, of which the upper triangles are there."""
+    place, mixed, motion = upper + np.swapaxes(np.triu(upper, 1), 1, 2)
+    out = np.empty((12, 12))
+    out[:6, :6], out[:6, 6:], out[6:, :6], out[6:, 6:] = place, mixed, mixed, motion
+    return out
 
 
 @njit(cache=True, nogil=True)
@@ -227,7 +280,7 @@ def _accumulate(
             if u > w.gate * w.gate:
                 tally[_REJECTED] += 1
                 continue
-            _add_row(H, b, J, p, tau, T, n, r, _robust(u, w.kernel) / variance)
+            _add_row(H[0], b[0], J, p, tau, T, n, r, _robust(u, w.kernel) / variance)
             tally[_PLANAR] += 1
             tally[_SQUARES] += r * r
         elif w.point_weight > 0:
@@ -240,7 +293,7 @@ def _accumulate(
             for a in range(3):
                 n[0], n[1], n[2] = 0.0, 0.0, 0.0
                 n[a] = 1.0
-                _add_row(H, b, J, p, tau, T, n, e[a], weight)
+                _add_row(H[1], b[1], J, p, tau, T, n, e[a], weight)
             tally[_OTHER] += 1
 
 
@@ -285,11 +338,16 @@ def linearise_plainly(
     # a plane counts along its normal, a point in every direction
     n = fit[:, NORMAL : NORMAL + 3]
     onto = np.where(flat[:, None, None], n[:, :, None] * n[:, None, :], np.eye(3))
-    H = np.einsum("n,naj,nab,nbk->jk", weight, J, onto, J, optimize=True)
-    b = np.einsum("n,naj,nab,nb->j", weight, J, onto, e, optimize=True)
+    planes, points = (
+        Equations(
+            np.einsum("n,naj,nab,nbk->jk", some, J, onto, J, optimize=True),
+            np.einsum("n,naj,nab,nb->j", some, J, onto, e, optimize=True),
+        )
+        for some in (weight * flat, weight * ~flat)
+    )
     planar = inside & flat
     rms = float(np.sqrt(square[planar].mean())) if planar.any() else float("nan")
-    return Linearised(H, b, int(planar.sum()), int((inside & ~flat).sum()), int((seen & ~inside).sum()), rms)
+    return Linearised(planes, points, int(planar.sum()), int((inside & ~flat).sum()), int((seen & ~inside).sum()), rms)
 
 
 def _chosen_plainly(places: F64, maps: tuple[VoxelMap, VoxelMap], w: Weighting) -> tuple[F64, Bool]:

@@ -74,7 +74,7 @@ class Flight:
         rays = np.einsum("nij,nrj->nri", poses[:, :3, :3], beams).reshape(-1, 3)
         ranges = self.scene(np.repeat(poses[:, :3, 3], RINGS, axis=0), rays) + rng.normal(0, self.sigma_m, len(rays))
         hit = np.isfinite(ranges)
-        points = (beams.reshape(-1, 3) * ranges[:, None])[hit].astype(np.float32)
+        points = (beams.reshape(-1, 3)[hit] * ranges[hit, None]).astype(np.float32)
         offsets = np.repeat(stamps - stamps[0], RINGS)[hit]
         return Sweep(int(stamps[0]), points, offsets, period_ns=PERIOD_NS)
 
