@@ -16,7 +16,7 @@ from mineloc import se3
 from mineloc.config import KeyframeConfig, OdometryConfig
 from mineloc.data import Calibration, ImuSamples, OdometryStep, Sweep
 from mineloc.errors import FlightError
-from mineloc.odometry.mineloc_front_end import LOST_SWEEPS, MinelocFrontEnd
+from mineloc.odometry.mineloc_front_end import MinelocFrontEnd
 
 AIRFRAME = Calibration(se3.exp([0.0, 0.1, 0.0, 0.1, 0.0, 0.2]), se3.exp([0.0, 0.0, 1.5, -0.05, 0.02, 0.0]))
 NO_IMU = OdometryConfig(use_imu=False)
@@ -121,18 +121,15 @@ def test_a_sweep_without_points_is_not_trusted_and_the_next_one_is(through_rock:
     )
 
 
-def test_another_place_is_not_believed_until_the_map_begins_anew() -> None:
+def test_another_place_is_told_and_nothing_is_invented() -> None:
     here = Flight(rough_tunnel(0.15), at_rest(), 12)
-    # 3 m to the side of a hall: most of what is seen is where nothing was
-    there = Flight(room(30.0, 25.0, 7.0), at_rest(), 12 + 2 * LOST_SWEEPS + 5)
+    there = Flight(room(12.0, 10.0, 1.9), at_rest(), 40)
     found = told(list(here.steps()) + list(there.steps())[12:], NO_IMU)
     assert all(step.trusted for step in found[:12])
-    doubted = [step for step in found[12:] if not step.trusted]
-    assert LOST_SWEEPS <= len(doubted) <= 2 * LOST_SWEEPS
-    assert all(step.reason for step in doubted)
+    assert not found[12].trusted
+    assert "inlier ratio" in found[12].reason or "matches" in found[12].reason
     assert found[-1].trusted
-    # nothing moved, and nothing was invented
-    assert np.linalg.norm(found[-1].T_odom_lidar[:3, 3]) < 1.0
+    assert np.linalg.norm(found[-1].T_odom_lidar[:3, 3]) < 0.5
 
 
 def test_time_that_goes_backwards_is_refused(through_rock: list[Step]) -> None:
