@@ -112,7 +112,7 @@ class Linearised(NamedTuple):
     def left_open(self, weak_ratio: float) -> F64:
         """(k, 3) directions in odom along which the planes hold next to nothing; see `degeneracy_of`.
 
-        None where there is no plane at all: then the points are all there is.
+        Empty where there is no plane at all: then the points are all there is.
         """
         weak = degeneracy_of(self.planes.H[:6, :6], self.planar, weak_ratio=weak_ratio).weak_directions
         return weak if len(weak) < 3 else weak[:0]
