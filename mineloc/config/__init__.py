@@ -14,6 +14,12 @@ from mineloc.config.estimation import KeyframeConfig as KeyframeConfig
 from mineloc.config.estimation import LoamConfig as LoamConfig
 from mineloc.config.estimation import OdometryConfig as OdometryConfig
 from mineloc.config.estimation import SweepConfig as SweepConfig
+from mineloc.config.features import Link3dConfig as Link3dConfig
+from mineloc.config.features import ScanContextConfig as ScanContextConfig
+from mineloc.config.mapping import ControlConfig as ControlConfig
+from mineloc.config.mapping import FusionConfig as FusionConfig
+from mineloc.config.mapping import LoopsConfig as LoopsConfig
+from mineloc.config.mapping import MapConfig as MapConfig
 from mineloc.config.recordings import IngestConfig as IngestConfig
 from mineloc.config.recordings import SimulateConfig as SimulateConfig
 from mineloc.config.reporting import EvaluateConfig as EvaluateConfig

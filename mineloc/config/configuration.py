@@ -11,6 +11,8 @@ from typing import Any, TypeVar, cast
 from pydantic import BaseModel, ValidationError
 
 from mineloc.config.estimation import GraphConfig, KeyframeConfig, LoamConfig, OdometryConfig, SweepConfig
+from mineloc.config.features import Link3dConfig, ScanContextConfig
+from mineloc.config.mapping import ControlConfig, FusionConfig, LoopsConfig, MapConfig
 from mineloc.config.recordings import IngestConfig, SimulateConfig
 from mineloc.config.reporting import EvaluateConfig, ReportConfig, ViewConfig
 from mineloc.config.section import Section
@@ -28,7 +30,13 @@ class Config(Section):
     keyframe: KeyframeConfig = KeyframeConfig()
     odometry: OdometryConfig = OdometryConfig()
     loam: LoamConfig = LoamConfig()
+    link3d: Link3dConfig = Link3dConfig()
+    scan_context: ScanContextConfig = ScanContextConfig()
+    loops: LoopsConfig = LoopsConfig()
     graph: GraphConfig = GraphConfig()
+    fusion: FusionConfig = FusionConfig()
+    control: ControlConfig = ControlConfig()
+    map: MapConfig = MapConfig()
     evaluate: EvaluateConfig = EvaluateConfig()
     report: ReportConfig = ReportConfig()
     view: ViewConfig = ViewConfig()

@@ -1,0 +1,1 @@
+"""Places: recognising where one has been, from sweeps alone."""

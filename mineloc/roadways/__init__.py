@@ -1,0 +1,1 @@
+"""The roadways of a mine: free space, centre-lines, the graph that they make."""
