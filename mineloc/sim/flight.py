@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mineloc.config import SimulateConfig
 from mineloc.data import Calibration, FlightInfo, ImuSamples, Sweep, Trajectory
 from mineloc.errors import SimulationError
+from mineloc.roadways.graph import RoadwayGraph
 from mineloc.sim.drone import drone_motion
 from mineloc.sim.imu import Imu, ImuNoise, mounting
 from mineloc.sim.lidar import LidarModel, lidar_model
@@ -18,7 +19,6 @@ from mineloc.sim.machine import Machine, in_front
 from mineloc.sim.mine import Mine
 from mineloc.sim.motion import Vibration
 from mineloc.sim.path import fly_line, passable
-from mineloc.sim.roadways import RoadwayGraph
 from mineloc.sim.scene import Scene
 from mineloc.sim.schedule import Limits, schedule
 from mineloc.sim.shots import RangeErrors, Returns, Shots, aim, firings_of, measure, points_of

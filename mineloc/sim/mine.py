@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mineloc.errors import SimulationError
+from mineloc.roadways.graph import RoadwayGraph, read_graph
 from mineloc.sim.builtin import BUILTIN
 from mineloc.sim.from_mesh import roadways_of_mesh
 from mineloc.sim.mesh_file import SUFFIXES, read_mesh
 from mineloc.sim.plan import MinePlan, plan_graph, read_plan
-from mineloc.sim.roadways import RoadwayGraph, read_graph
 from mineloc.sim.rock import rock_mesh
 from mineloc.sim.scene import Scene
 

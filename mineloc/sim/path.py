@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from mineloc.errors import SimulationError
-from mineloc.sim.roadways import Roadway, RoadwayGraph
+from mineloc.roadways.graph import Roadway, RoadwayGraph
 from mineloc.sim.scene import Scene
 from mineloc.sim.tour import Step
 

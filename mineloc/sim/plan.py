@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from mineloc.config import Section, read_toml, validate
-from mineloc.sim.roadways import Roadway, RoadwayGraph
+from mineloc.roadways.graph import Roadway, RoadwayGraph
 
 F64 = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import networkx as nx
 import numpy as np
 
 from mineloc.errors import SimulationError
-from mineloc.sim.roadways import RoadwayGraph
+from mineloc.roadways.graph import RoadwayGraph
 
 
 @dataclass(frozen=True, slots=True)

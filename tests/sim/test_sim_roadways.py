@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mineloc.errors import FormatError, SimulationError
+from mineloc.roadways.graph import Roadway, RoadwayGraph, read_graph
 from mineloc.sim.from_mesh import roadways_of_mesh
 from mineloc.sim.mine import Mine, load_mine, planned_mine
 from mineloc.sim.path import fly_line, mid_height, passable, resample
 from mineloc.sim.plan import MinePlan, RoughnessPlan, roadway
-from mineloc.sim.roadways import Roadway, RoadwayGraph, read_graph
 from mineloc.sim.scene import Scene
 from mineloc.sim.tour import plan_tour
 

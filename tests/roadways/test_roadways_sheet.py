@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.ndimage import distance_transform_edt, label
 
-from mineloc.sim.sheet import Sheet, clearance_cells, components, link
-from mineloc.sim.skeleton import thin, trace
+from mineloc.roadways.sheet import Sheet, clearance_cells, components, link
+from mineloc.roadways.skeleton import thin, trace
 
 
 def _sheet(mask: np.ndarray) -> Sheet:

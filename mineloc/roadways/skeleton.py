@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mineloc.compiled import njit
-from mineloc.sim.sheet import Sheet, components
+from mineloc.roadways.sheet import Sheet, components
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
