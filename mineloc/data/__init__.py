@@ -13,6 +13,8 @@ from mineloc.data.arrays import Bool as Bool
 from mineloc.data.camera import CameraModel as CameraModel
 from mineloc.data.camera import DepthImage as DepthImage
 from mineloc.data.camera import GreyImage as GreyImage
+from mineloc.data.control import ControlPoint as ControlPoint
+from mineloc.data.control import Observation as Observation
 from mineloc.data.estimate import Degeneracy as Degeneracy
 from mineloc.data.estimate import Fix as Fix
 from mineloc.data.estimate import Keyframe as Keyframe
