@@ -6,6 +6,7 @@ place), `imu`, `lidar`, `camera`. Times are integer nanoseconds since the epoch.
 
 from mineloc.data.arrays import F32 as F32
 from mineloc.data.arrays import F64 as F64
+from mineloc.data.arrays import I32 as I32
 from mineloc.data.arrays import I64 as I64
 from mineloc.data.arrays import U8 as U8
 from mineloc.data.arrays import U16 as U16
@@ -23,5 +24,7 @@ from mineloc.data.estimate import RelativePose as RelativePose
 from mineloc.data.flight import Calibration as Calibration
 from mineloc.data.flight import FlightInfo as FlightInfo
 from mineloc.data.flight import Trajectory as Trajectory
+from mineloc.data.map_cloud import MapCloud as MapCloud
+from mineloc.data.map_cloud import SurfaceKind as SurfaceKind
 from mineloc.data.sweep import ImuSamples as ImuSamples
 from mineloc.data.sweep import Sweep as Sweep
