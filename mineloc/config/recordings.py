@@ -51,3 +51,14 @@ class SimulateConfig(Section):
     accel_noise_mps2_rthz: float = Field(default=0.002, ge=0)
     accel_bias_mps2: float = Field(default=0.03, ge=0)
     accel_walk_mps3_rthz: float = Field(default=0.0002, ge=0)
+    target_every_m: float = Field(
+        default=0.0, ge=0, description="no longer way without a surveyed target near by; 0: there are none"
+    )
+    target_sigma_m: float = Field(default=0.005, gt=0, le=1, description="of the survey, one axis")
+    pick_sigma_m: float = Field(default=0.01, gt=0, le=1, description="of a target picked in a sweep, one axis")
+    grid_e_m: float = Field(default=0.0, description="easting of the map's origin in the mine grid")
+    grid_n_m: float = Field(default=0.0, description="northing of the map's origin in the mine grid")
+    grid_z_m: float = Field(default=0.0, description="height of the map's origin in the mine grid")
+    grid_yaw_deg: float = Field(default=0.0, description="of the map's x axis in the mine grid, from east to north")
+    tags: bool = Field(default=False, description="targets are AprilTags, and a grey camera sees them")
+    tag_size_m: float = Field(default=0.3, ge=0.05, le=2, description="edge of a tag's black square")

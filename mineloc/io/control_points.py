@@ -23,6 +23,7 @@ import numpy as np
 from mineloc.data import ControlPoint, Observation
 from mineloc.data.control import is_plain, z_up_from_y_up
 from mineloc.errors import FormatError
+from mineloc.io.flight_reader import FlightReader
 
 Axes = Literal["z_up", "y_up"]
 
@@ -159,6 +160,47 @@ def parse_observations(content: bytes, points: Sequence[ControlPoint], *, where:
     return tuple(out)
 
 
+def read_flight_survey(flight: FlightReader) -> tuple[tuple[ControlPoint, ...], tuple[Observation, ...]]:
+    """Targets (z up) and observations that are attached to a flight; empty where there are none.
+
+    Raises:
+        FormatError: an attachment is not what its name says.
+        IngestError: it is damaged.
+    """
+    points: tuple[ControlPoint, ...] = ()
+    if TARGETS_FILE in flight.attachment_names:
+        points = parse_control_points(flight.attachment(TARGETS_FILE), where=f"{flight.path}:{TARGETS_FILE}")
+    if OBSERVATIONS_FILE not in flight.attachment_names:
+        return points, ()
+    where = f"{flight.path}:{OBSERVATIONS_FILE}"
+    return points, parse_observations(flight.attachment(OBSERVATIONS_FILE), points, where=where)
+
+
+def merged_control_points(surveys: Sequence[tuple[str, Sequence[ControlPoint]]]) -> tuple[ControlPoint, ...]:
+    """The targets of several surveys, each with the name of its file; what is in two of them must be the same in both.
+
+    Raises:
+        FormatError: two targets of one name, or one tag, that differ.
+    """
+    out: dict[str, ControlPoint] = {}
+    source: dict[str, str] = {}
+    for where, points in surveys:
+        for point in points:
+            other = out.get(point.name)
+            if other is None:
+                other = next((p for p in out.values() if p.tag_id is not None and p.tag_id == point.tag_id), None)
+            if other is None:
+                out[point.name], source[point.name] = point, where
+            elif not _same(point, other):
+                raise FormatError(
+                    where,
+                    f"target {point.name!r} is not as {other.name!r} in {source[other.name]}",
+                    expected="one name and tag, one place",
+                    todo="rename one of the two or correct it",
+                )
+    return tuple(out.values())
+
+
 def control_points_csv(points: Sequence[ControlPoint]) -> bytes:
     """Targets as a file, z up; millimetre and finer digits are kept."""
     columns = ("name", *_COORDINATES["z_up"], "sigma_m", "sigma_z_m", "role", "tag_id", "tag_size_m")
@@ -213,6 +255,11 @@ def _control_point(row: _Row, place: tuple[str, ...], axes: Axes) -> ControlPoin
         tag_id=row.integer("tag_id", most=TAG_IDS - 1, what=f"a tag36h11 id, 0 to {TAG_IDS - 1}") if tag_id else None,
         tag_size_m=_tag_size(row) if size_m else None,
     )
+
+
+def _same(a: ControlPoint, b: ControlPoint) -> bool:
+    facts = [(p.name, p.role, p.sigma_m, p.sigma_z_m, p.tag_id, p.tag_size_m, p.position_grid.tolist()) for p in (a, b)]
+    return facts[0] == facts[1]
 
 
 def _tag_size(row: _Row) -> float:

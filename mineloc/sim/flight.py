@@ -96,6 +96,7 @@ class SimulatedFlight:
         )
         self.machine = Machine(self.motion, scene) if config.machine else None
         self.sweeps = int(self.motion.end_s * config.lidar_hz) - 1
+        self.lost = missing(self.sweeps, config.sweep_loss, _rng(config.seed, _LOSS))
         self.info = FlightInfo(
             flight=f"{mine.name}-{config.seed}",
             site=mine.name,
@@ -122,7 +123,6 @@ class SimulatedFlight:
             start_ns=START_NS,
             rng=_rng(config.seed, _IMU),
         )
-        lost = missing(self.sweeps, config.sweep_loss, _rng(config.seed, _LOSS))
         period_ns = round(1e9 / config.lidar_hz)
         for revolution in range(self.sweeps):
             begin_ns, end_ns = revolution * period_ns, (revolution + 1) * period_ns
@@ -130,7 +130,7 @@ class SimulatedFlight:
                 end_ns += AFTER_NS
             stamps = START_NS + np.arange(-(-begin_ns // TRUTH_NS), -(-end_ns // TRUTH_NS), dtype=np.int64) * TRUTH_NS
             yield Packet(
-                None if lost[revolution] else self.sweep(revolution),
+                None if self.lost[revolution] else self.sweep(revolution),
                 imu.until(START_NS + end_ns),
                 Trajectory(stamps, self.pose(stamps)),
             )

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 
 from mineloc.config import Config
+from mineloc.io import control_points as survey_files
 from mineloc.io.flight import FlightWriter
 from mineloc.progress import Progress, quiet
 from mineloc.sim.flight import SimulatedFlight
 from mineloc.sim.mine import load_mine
+from mineloc.sim.targets import GRID_FILE, TargetSurvey, survey_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +97,10 @@ def _write(flight: SimulatedFlight, out: Path, progress: Progress) -> tuple[int,
     """Sweeps and points written, and the length of the true path."""
     sweeps = points = 0
     path_m, last_m = 0.0, flight.motion.pose(np.zeros(1))[0, :3, 3]
+    survey = survey_of(flight)
     with FlightWriter(out, flight.info, flight.calibration) as writer:
+        if survey is not None:
+            _attach(survey, writer)
         for done, packet in enumerate(flight.packets(), start=1):
             if packet.sweep is not None:
                 writer.add_sweep(packet.sweep)
@@ -108,3 +113,14 @@ def _write(flight: SimulatedFlight, out: Path, progress: Progress) -> tuple[int,
             last_m = line_m[-1]
             progress(done, flight.sweeps, "sweeps")
     return sweeps, points, path_m
+
+
+def _attach(survey: TargetSurvey, writer: FlightWriter) -> None:
+    """The targets, what was picked of them, and the truth of the mine grid."""
+    writer.add_attachment(
+        survey_files.TARGETS_FILE, survey_files.MEDIA_TYPE, survey_files.control_points_csv(survey.points)
+    )
+    writer.add_attachment(
+        survey_files.OBSERVATIONS_FILE, survey_files.MEDIA_TYPE, survey_files.observations_csv(survey.observations)
+    )
+    writer.add_attachment(GRID_FILE, "application/json", survey.grid_json())

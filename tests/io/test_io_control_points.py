@@ -7,17 +7,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mineloc.data import ControlPoint, Observation
+from mineloc.data import Calibration, ControlPoint, FlightInfo, Observation
 from mineloc.data.control import is_plain, z_up_from_y_up
 from mineloc.errors import FormatError
 from mineloc.io.control_points import (
     control_points_csv,
+    merged_control_points,
     observations_csv,
     parse_control_points,
     parse_observations,
     read_control_points,
+    read_flight_survey,
     read_observations,
 )
+from mineloc.io.flight import FlightReader, FlightWriter
 
 HEAD = "name,e_m,n_m,z_m,sigma_m,role"
 SEEN = "target,flight,stamp_ns,x_m,y_m,z_m,sigma_m"
@@ -251,3 +254,36 @@ def test_nouns_refuse_what_no_survey_is() -> None:
         ControlPoint("A", np.zeros(3), 0.01, 0.01, "control", tag_id=3)
     with pytest.raises(ValueError, match="positive definite"):
         Observation("A", "", 0, np.zeros(3), np.zeros((3, 3)))
+
+
+def test_a_flight_brings_its_survey_along(tmp_path: Path) -> None:
+    seen = [Observation.picked("A", "", 5, np.array([1.0, 2, 3]), sigma_m=0.01)]
+    with FlightWriter(tmp_path / "f.mcap", FlightInfo(), Calibration()) as writer:
+        writer.add_attachment("control_points.csv", "text/csv", control_points_csv(TARGETS))
+        writer.add_attachment("observations.csv", "text/csv", observations_csv(seen))
+    with FlightWriter(tmp_path / "wrong.mcap", FlightInfo(), Calibration()) as writer:
+        writer.add_attachment("observations.csv", "text/csv", observations_csv(seen))
+    with FlightWriter(tmp_path / "none.mcap", FlightInfo(), Calibration()):
+        pass
+    with FlightReader(tmp_path / "f.mcap") as flight:
+        points, observations = read_flight_survey(flight)
+    assert ([p.name for p in points], [o.target for o in observations]) == (["A", "B"], ["A"])
+    with FlightReader(tmp_path / "none.mcap") as flight:
+        assert read_flight_survey(flight) == ((), ())
+    with (
+        FlightReader(tmp_path / "wrong.mcap") as flight,
+        pytest.raises(FormatError, match=r"wrong.mcap:observations.csv, line 2: target 'A' is not surveyed"),
+    ):
+        read_flight_survey(flight)
+
+
+def test_surveys_of_several_flights_become_one_unless_they_differ() -> None:
+    other = ControlPoint("C", np.array([7.0, 8, 9]), 0.005, 0.005, "control", 4, 0.2)
+    merged = merged_control_points([("one", TARGETS), ("two", [other]), ("three", [TARGETS[0], other])])
+    assert [p.name for p in merged] == ["A", "B", "C"]
+    moved = ControlPoint("A", np.array([1.0, 2, 3.001]), 0.005, 0.005, "control")
+    with pytest.raises(FormatError, match="two: target 'A' is not as 'A' in one; expected one name"):
+        merged_control_points([("one", TARGETS), ("two", [moved])])
+    again = ControlPoint("D", np.array([7.0, 8, 9]), 0.005, 0.005, "control", 4, 0.2)
+    with pytest.raises(FormatError, match="target 'D' is not as 'C' in one"):
+        merged_control_points([("one", [other]), ("two", [again])])
