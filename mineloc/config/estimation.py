@@ -50,6 +50,11 @@ class OdometryConfig(Section):
     information_share: float = Field(
         default=0.1, gt=0, le=1, description="neighbouring residuals share their errors: n count as so many n"
     )
+    edge_correlation: float = Field(
+        default=1.0, gt=0, description="so many residuals count as one in the noise of a relative pose"
+    )
+    edge_floor_rad: float = Field(default=1e-4, gt=0, description="no relative pose is better")
+    edge_floor_m: float = Field(default=0.002, gt=0, description="no relative pose is better")
     rounds: int = Field(default=6, ge=1)
     forget_after_m: float = Field(default=150.0, gt=0, description="patches not seen for so long a way are dropped")
     min_matches: int = Field(default=60, ge=6)
@@ -107,6 +112,8 @@ class GraphConfig(Section):
     anchor_m: float = Field(default=0.001, gt=0, description="the first position defines the map")
     anchor_yaw_deg: float = Field(default=0.01, gt=0, description="the first heading defines the map")
     anchor_tilt_deg: float = Field(default=0.5, gt=0, description="of the first levelling")
+    joined_m: float = Field(default=3.0, gt=0, description="of a flight's first position where only places joined it")
+    joined_deg: float = Field(default=3.0, gt=0, description="of its first attitude then")
     relative_max_m: float = Field(default=3.0, gt=0, description="no motion between keyframes is known less")
     relative_max_deg: float = Field(default=20.0, gt=0, description="no motion between keyframes is known less")
     robust: bool = Field(default=True, description="Cauchy kernel on fixes and loops")

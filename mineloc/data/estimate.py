@@ -88,6 +88,8 @@ class OdometryStep:
         inlier_ratio: share of the registered points that found a match.
         residual_m: root mean square of the matched residuals.
         points_used: number of points that went into the registration.
+        points_lidar: (n, 3) float32 points of the sweep as if all were measured at `stamp_ns`, thinned; None when
+            nobody wants them any more.
     """
 
     stamp_ns: int
@@ -100,6 +102,7 @@ class OdometryStep:
     inlier_ratio: float = float("nan")
     residual_m: float = float("nan")
     points_used: int = 0
+    points_lidar: F32 | None = None
 
     def __post_init__(self) -> None:
         need(self.trusted or bool(self.reason), "an untrusted step must say why")

@@ -7,7 +7,7 @@ import numpy as np
 
 from mineloc import se3
 from mineloc.data import F64
-from mineloc.graph.pose_graph import ROBUST, PoseGraph
+from mineloc.graph.pose_graph import ROBUST, PoseGraph, poses_of
 
 _RELINEARIZE_EVERY = 10  # updates, when there is nothing but odometry and gravity
 _SETTLED = 1e-3  # metres, or of a rotation matrix
@@ -57,6 +57,10 @@ class CausalEstimate:
             if np.abs(self._newest - before).max() < _SETTLED:
                 break
         return self._newest
+
+    def poses(self) -> F64:
+        """(n, 4, 4) `T_map_lidar` of all keyframes, from what was measured up to the last update."""
+        return poses_of(self._isam.calculateEstimate(), self._known)
 
     def _estimate(self) -> F64:
         return np.asarray(self._isam.calculateEstimatePose3(self._known - 1).matrix())

@@ -6,7 +6,7 @@ depend on them; paper A's Jacobians, left and translation first, do (METHOD 7.6)
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -80,6 +80,27 @@ class PoseGraph:
         self._add("prior", (0,), noise, gtsam.PriorFactorPose3(0, _pose3(pose), model))
         self.factors += gravity
 
+    def add_another(self, keyframe: Keyframe, *, T_map_lidar: F64, covariance: F64 | None = None) -> None:
+        """The first keyframe of another flight; loops and fixes must tie it to the others.
+
+        Args:
+            keyframe: its index is the number of keyframes so far.
+            T_map_lidar: (4, 4) where it is believed to be.
+            covariance: (6, 6) of that, `[rotation, translation]`; `joined_m` and `joined_deg` by default.
+
+        Raises:
+            ValueError: the index does not continue, or "up" is no direction.
+        """
+        if keyframe.index != len(self) or not self.initial:
+            raise ValueError(f"keyframe {keyframe.index} begins a flight after {len(self)} keyframes")
+        turn, shift = np.radians(self.config.joined_deg), self.config.joined_m
+        noise = np.diag([turn**2] * 3 + [shift**2] * 3) if covariance is None else positive_definite(covariance)
+        gravity = self._gravity(keyframe)
+        self.initial.append(T_map_lidar)
+        model = gtsam.noiseModel.Gaussian.Covariance(noise)
+        self._add("prior", (keyframe.index,), noise, gtsam.PriorFactorPose3(keyframe.index, _pose3(T_map_lidar), model))
+        self.factors += gravity
+
     def add_next(self, keyframe: Keyframe, relative: RelativePose) -> None:
         """The next keyframe and the motion that leads to it.
 
@@ -109,6 +130,26 @@ class PoseGraph:
         if relative.i == relative.j:
             raise ValueError(f"a loop from keyframe {relative.i} to itself")
         self._add_between("loop", relative, edge_noise(relative.information, self.config).covariance)
+
+    def replace_loops(self, loops: Iterable[RelativePose]) -> None:
+        """These loop closures in place of all that were added before.
+
+        Raises:
+            ValueError: as `add_loop`.
+        """
+        self.factors = [factor for factor in self.factors if factor.kind != "loop"]
+        for loop in loops:
+            self.add_loop(loop)
+
+    def replace_point_fixes(self, fixes: Iterable[PointFix]) -> None:
+        """These point fixes in place of all that were added before.
+
+        Raises:
+            ValueError: as `add_point_fix`.
+        """
+        self.factors = [factor for factor in self.factors if factor.kind != "point_fix"]
+        for fix in fixes:
+            self.add_point_fix(fix)
 
     def add_fix(self, fix: Fix) -> None:
         """Pose of a keyframe in the map. Robust.

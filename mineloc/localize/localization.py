@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import perf_counter
 
 import numpy as np
 
-from mineloc.data import F64, Calibration, Fix, ImuSamples, Keyframe, OdometryStep, Sweep, Trajectory
+from mineloc.data import F64, Calibration, Fix, ImuSamples, Keyframe, OdometryStep, RelativePose, Sweep, Trajectory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,7 +35,10 @@ class Localization:
         steps: what the front end said, one a sweep, without keyframe points.
         keyframes: nodes of the graph; `keyframe_poses` (k, 4, 4) their smoothed `T_map_lidar`, `covariances`
             (k, 6, 6) `[rotation, translation]`, right perturbation.
+        edges: what leads to each keyframe, None for the first.
+        loops: closures that the smoothed estimate rests on.
         fixes: recognitions, accepted or refused.
+        counts: what the front end counted, by name.
         seconds: by module, one entry a call.
     """
 
@@ -43,9 +46,12 @@ class Localization:
     online: Trajectory
     steps: Sequence[OdometryStep]
     keyframes: Sequence[Keyframe]
+    edges: Sequence[RelativePose | None]
     keyframe_poses: F64
     covariances: F64
+    loops: Sequence[RelativePose]
     fixes: Sequence[Fix]
+    counts: Mapping[str, int]
     seconds: dict[str, list[float]]
 
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 from mineloc.config import Config
 from mineloc.data import Calibration
 from mineloc.errors import ConfigError
+from mineloc.localize.graph_method import GraphMethod
 from mineloc.localize.localization import FlightData, Localization
-from mineloc.localize.relative import RelativeMethod
+from mineloc.localize.loops import LoopCloser
 from mineloc.odometry.front_end import FrontEnd
 from mineloc.odometry.loam import LoamFrontEnd
 from mineloc.odometry.mineloc_front_end import MinelocFrontEnd
@@ -33,11 +35,19 @@ class Method:
         front_end: its name, as the result row tells it.
         make_front_end: from configuration and calibration.
         summary: one line for people.
+        loops: where loop closures come from: "place" (Scan Context), "position" (the estimate), both or none.
     """
 
     front_end: str
     make_front_end: Callable[[Config, Calibration], FrontEnd]
     summary: str
+    loops: frozenset[Literal["place", "position"]] = frozenset()
+
+    def closer(self, config: Config) -> LoopCloser | None:
+        """What finds the method's loop closures, None for an open-loop method."""
+        if not self.loops:
+            return None
+        return LoopCloser(config, by_place="place" in self.loops, by_position="position" in self.loops)
 
     def run(self, flight: FlightData, config: Config, *, progress: Progress = quiet) -> Localization:
         """Localize a flight.
@@ -46,12 +56,16 @@ class Method:
             FlightError: fewer than two sweeps, no points, time going backwards.
         """
         front_end = self.make_front_end(config, flight.calibration)
-        return RelativeMethod(config, front_end).run(flight, progress)
+        return GraphMethod(config, front_end, closer=self.closer(config)).run(flight, progress)
 
 
 METHODS: dict[str, Method] = {
     "odometry": Method("mineloc", _mineloc, "the mineloc front end and gravity, no absolute information"),
+    "odometry_loops": Method(
+        "mineloc", _mineloc, "the mineloc front end with loop closures", frozenset({"place", "position"})
+    ),
     "loam": Method("loam", _loam, "LOAM as published, the baseline of both papers"),
+    "loam_scan_context": Method("loam", _loam, "LOAM with Scan Context loop closures", frozenset({"place"})),
 }
 
 

@@ -205,6 +205,7 @@ class MinelocFrontEnd:
             inlier_ratio=registered.inlier_ratio,
             residual_m=float("nan") if last is None else last.residual_m,
             points_used=registered.points,
+            points_lidar=cloud.points.astype(np.float32),
         )
 
     def _edge(self, registered: _Registered, degeneracy: Degeneracy | None) -> RelativePose | None:
@@ -212,7 +213,13 @@ class MinelocFrontEnd:
         if T_i_j is None:
             return None
         # the registration's rows are weighted by their own variances already: σ enters as 1/√2, that 2σ² is 1
-        noise = EdgeNoise(sigma_m=float(np.sqrt(0.5)), correlation=1.0 / self._config.information_share)
+        c = self._config
+        noise = EdgeNoise(
+            sigma_m=float(np.sqrt(0.5)),
+            correlation=c.edge_correlation,
+            floor_rad=c.edge_floor_rad,
+            floor_m=c.edge_floor_m,
+        )
         judged = degeneracy or degeneracy_of(registered.hessian_lidar, 0)
         information = edge_information(registered.hessian_lidar, judged, noise=noise, coasted_s=self._coasted_s)
         return RelativePose(j - 1, j, T_i_j, information)

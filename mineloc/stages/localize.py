@@ -25,7 +25,7 @@ from mineloc.stages.run_tables import fixes_table, pose_columns, sigmas
 
 POINTS_A_KEYFRAME = 250
 """Enough to draw the mine; the map of a survey comes from `reconstruct`."""
-_SECTIONS = {"sweep", "keyframe", "odometry", "loam", "graph"}
+_SECTIONS = {"sweep", "keyframe", "odometry", "loam", "link3d", "scan_context", "loops", "graph"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,6 +174,7 @@ def _counts(found: Localization, recorded: int) -> dict[str, int]:
         "degenerate": sum(step.degeneracy is not None and step.degeneracy.is_degenerate for step in found.steps),
         "fixes_accepted": sum(fix.trusted for fix in found.fixes),
         "fixes_refused": sum(not fix.trusted for fix in found.fixes),
+        **found.counts,
     }
 
 

@@ -10,7 +10,7 @@ LOCALIZE = Stage(
     "localize",
     1,
     "mineloc.stages.localize:localize",
-    ("sweep", "keyframe", "odometry", "loam", "graph"),
+    ("sweep", "keyframe", "odometry", "loam", "link3d", "scan_context", "loops", "graph"),
     volatile=frozenset({"timing.json"}),
 )
 EVALUATE = Stage("evaluate", 1, "mineloc.survey.score:score", ("evaluate",))
