@@ -29,15 +29,17 @@ def largest_part(sheet: Sheet) -> Sheet:
     return sheet.keep(part == np.bincount(part).argmax())
 
 
-def centre_lines(sheet: Sheet) -> RoadwayGraph:
+def centre_lines(sheet: Sheet, *, rooms_overlap: bool = False) -> RoadwayGraph:
     """The roadways of a sheet as centre-lines on the floor; of pieces apart, the longest alone.
 
     Args:
         sheet: free space; may be empty, then the graph is too.
+        rooms_overlap: two junctions are one when the largest circles that fit at them overlap, as where two roadways
+            cross a little apart; False: only when one lies within the other's.
     """
     clearance = clearance_cells(sheet.links, sheet.column, sheet.row)
     skeleton = trace(sheet, thin(sheet.links, clearance)) if len(sheet) else Skeleton([], [])
-    net = _Net(sheet, skeleton, clearance * sheet.cell_m)
+    net = _Net(sheet, skeleton, clearance * sheet.cell_m, rooms_overlap=rooms_overlap)
     net.clean()
     return net.graph()
 
@@ -60,7 +62,8 @@ class _Edge:
 class _Net:
     """The raw graph of a skeleton, changed step by step until nothing is left to clean."""
 
-    def __init__(self, sheet: Sheet, skeleton: Skeleton, clearance_m: F64) -> None:
+    def __init__(self, sheet: Sheet, skeleton: Skeleton, clearance_m: F64, *, rooms_overlap: bool) -> None:
+        self.rooms_overlap = rooms_overlap
         self.nodes: dict[int, F64] = {}
         self.room: dict[int, float] = {}
         self.edges: list[_Edge] = []
@@ -109,10 +112,11 @@ class _Net:
         return bool(dropped)
 
     def _contract(self) -> bool:
-        """Join two junctions that lie within one another's room: together they are one intersection."""
+        """Join two junctions that share their room: together they are one intersection."""
         degree = self._degrees()
         for index, edge in enumerate(self.edges):
-            near = max(self.room[edge.a], self.room[edge.b])
+            rooms = self.room[edge.a], self.room[edge.b]
+            near = sum(rooms) if self.rooms_overlap else max(rooms)
             if edge.a != edge.b and min(degree[edge.a], degree[edge.b]) >= 3 and edge.length_m < near:
                 del self.edges[index]
                 self._merge(edge.a, edge.b)
