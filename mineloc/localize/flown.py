@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -66,6 +66,7 @@ class Flown:
         steps: one a sweep, without points.
         keyframes, edges: nodes and what leads to each, None for the first.
         T_map_odom: (4, 4) the levelled start.
+        counts: what the front end counted, by name.
         clock: seconds by module.
     """
 
@@ -73,6 +74,7 @@ class Flown:
     keyframes: Sequence[Keyframe]
     edges: Sequence[RelativePose | None]
     T_map_odom: F64
+    counts: Mapping[str, int]
     clock: Clock
 
     @property
@@ -112,7 +114,12 @@ def fly(
             keyframes.append(step.keyframe)
             edges.append(step.relative_pose)
         steps.append(without_points(step))
-    return Flown(steps, keyframes, edges, T_map_odom, clock)
+    return Flown(steps, keyframes, edges, T_map_odom, counts_of(front_end), clock)
+
+
+def counts_of(front_end: FrontEnd) -> Mapping[str, int]:
+    """What a front end counted, if it counts."""
+    return dict(getattr(front_end, "counts", {}))
 
 
 def without_points(step: OdometryStep) -> OdometryStep:

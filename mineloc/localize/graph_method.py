@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from mineloc import se3
@@ -13,7 +11,7 @@ from mineloc.graph.batch import solve
 from mineloc.graph.causal import CausalEstimate
 from mineloc.graph.pose_graph import PoseGraph
 from mineloc.graph.spread import spread
-from mineloc.localize.flown import first_origin, front_end_steps, without_points
+from mineloc.localize.flown import counts_of, first_origin, front_end_steps, without_points
 from mineloc.localize.localization import Clock, FlightData, Localization
 from mineloc.localize.loops import LoopCloser
 from mineloc.odometry.front_end import FrontEnd
@@ -106,9 +104,6 @@ class GraphMethod:
             covariances=solution.covariances,
             loops=() if self._closer is None else tuple(self._closer.loops),
             fixes=() if self._closer is None else self._closer.fixes(solution.poses),
-            counts=self._counts(),
+            counts=counts_of(self._front_end),
             seconds=dict(self._clock.seconds),
         )
-
-    def _counts(self) -> Mapping[str, int]:
-        return getattr(self._front_end, "counts", {})
