@@ -260,3 +260,33 @@ def test_a_chain_of_thousands_of_keyframes_stays_rigid_and_determined():
         assert np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max() < 1e-9
     assert np.abs(solution.poses - graph.initial).max() < 1e-6
     assert np.all(np.linalg.eigvalsh(solution.covariances) > 0)
+
+
+def test_ten_false_loops_of_forty_do_not_move_the_map() -> None:
+    """False loops that slip through all checks: the map is as if they were not there."""
+    without, truth = _looped(false=0)
+    planted, _ = _looped(false=10)
+    assert rmse_m(planted, truth) < 1.1 * rmse_m(without, truth)
+    assert rmse_m(planted, without) < 0.1 * rmse_m(without, truth)
+    # a plain least-squares graph fails the same case
+    plain, _ = _looped(false=10, config=GraphConfig(robust=False))
+    assert rmse_m(plain, truth) > 5 * rmse_m(without, truth)
+
+
+def _looped(*, false: int, config: GraphConfig | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Thirty right loops between visits of one place; false ones claim that two places are one. Poses, truth."""
+    scene = measure(tour(visits=45, spacing_m=25, seed=5), config)
+    scene.graph.factors = [factor for factor in scene.graph.factors if factor.kind != "point_fix"]
+    sigma = np.r_[np.radians([0.3] * 3), [0.05] * 3]
+    every = [(a, b, p == q) for n, (b, p) in enumerate(scene.visits) for a, q in scene.visits[:n]]
+    rng = np.random.default_rng(6)
+    for is_right, count in ((True, 30), (False, false)):
+        pairs = [(a, b) for a, b, same in every if same == is_right]
+        for k in rng.choice(len(pairs), count, replace=False):
+            i, j = pairs[k]
+            T = se3.inverse(scene.truth[i]) @ scene.truth[j]
+            if not is_right:
+                T[:3, 3] = rng.normal(size=3) * 0.3
+            T = se3.rigid(T @ se3.exp(rng.normal(size=6) * sigma))
+            scene.graph.add_loop(RelativePose(i, j, T, np.diag(sigma**-2)))
+    return solve(scene.graph).poses, scene.truth
