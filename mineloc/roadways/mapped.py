@@ -91,6 +91,11 @@ class MappedRoadways:
         return [len(roads) for roads in self.graph.at_node()]
 
     @property
+    def intersections(self) -> list[int]:
+        """Nodes where at least three roadways meet."""
+        return self.graph.intersections
+
+    @property
     def length_m(self) -> float:
         """Total length."""
         return sum(road.length_m for road in self.roadways)
