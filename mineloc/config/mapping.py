@@ -65,6 +65,9 @@ class ControlConfig(Section):
     origin_step_m: float = Field(default=1000.0, gt=0, description="the local origin is a multiple of it")
     anchor_m: float = Field(default=10.0, gt=0, description="the first position, where control points decide")
     anchor_yaw_deg: float = Field(default=10.0, gt=0, description="the first heading, where control points decide")
+    gravity_sigma_deg: float = Field(
+        default=20.0, gt=0, description="of a keyframe's measured up, where control points see the tilt better"
+    )
     between: float = Field(
         default=0.01, ge=0, description="share of the way from a keyframe to a sighting that odometry is off by"
     )

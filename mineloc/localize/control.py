@@ -193,6 +193,16 @@ def residuals(reference: GridReference, poses: F64) -> ControlTable:
     )
 
 
+def graph_with_control(graph: GraphConfig, config: ControlConfig) -> GraphConfig:
+    """How a graph with control points is configured: gravity is believed much less.
+
+    An accelerometer's bias tilts "up" by the same tenths of a degree in all keyframes. A thousand factors that each
+    claim an error of their own hold that tilt against the targets, and the map sags between them.
+    """
+    sigma_deg = max(graph.gravity_sigma_deg, config.gravity_sigma_deg)
+    return graph.model_copy(update={"gravity_sigma_deg": sigma_deg})
+
+
 def local_origin(points: Sequence[ControlPoint], *, step_m: float) -> F64:
     """(3,) multiples of `step_m` below the middle of the survey: it depends on no flight."""
     middle = np.mean([point.position_grid for point in points], axis=0)

@@ -12,7 +12,14 @@ from mineloc.config import ControlConfig, GraphConfig
 from mineloc.data import ControlPoint, Keyframe, Observation, RelativePose, Trajectory
 from mineloc.graph.batch import solve
 from mineloc.graph.pose_graph import PoseGraph
-from mineloc.localize.control import GridReference, judge, local_origin, place_in_grid, residuals
+from mineloc.localize.control import (
+    GridReference,
+    graph_with_control,
+    judge,
+    local_origin,
+    place_in_grid,
+    residuals,
+)
 from mineloc.localize.sightings import FlownPoses, carry_to_keyframes
 from mineloc.mapping.control import verdict_of
 
@@ -96,20 +103,28 @@ def _survey(flight: Flight, *, count: int, seed: int, each: int = 4, checks: boo
     return points, seen
 
 
-def _graph(flight: Flight, reference: GridReference, config: GraphConfig = GRAPH) -> PoseGraph:
+def _graph(
+    flight: Flight,
+    reference: GridReference,
+    config: GraphConfig = GRAPH,
+    *,
+    claimed: float = 1.0,
+    up: tuple[float, float, float] = (0, 0, 1),
+) -> PoseGraph:
+    """Edges claim `claimed` times the error that they have; `up` is what the IMU says, in the map."""
     graph = PoseGraph(config)
     placement = reference.placements[0]
     assert placement.T_local_map is not None
     rows = flight.keyframes
     for k, row in enumerate(rows):
-        up = flight.truth[row, :3, :3].T @ [0, 0, 1.0]
-        keyframe = Keyframe(k, int(flight.odometry.stamps_ns[row]), flight.odometry.poses[row], _NONE, up)
+        up_lidar = flight.truth[row, :3, :3].T @ np.array(up)
+        keyframe = Keyframe(k, int(flight.odometry.stamps_ns[row]), flight.odometry.poses[row], _NONE, up_lidar)
         if k == 0:
             first = placement.T_local_map @ flight.odometry.poses[0]
             graph.add_first(keyframe, T_map_lidar=first, covariance=placement.anchor_covariance)
         else:
             T = se3.rigid(se3.inverse(flight.odometry.poses[rows[k - 1]]) @ flight.odometry.poses[row])
-            graph.add_next(keyframe, RelativePose(k - 1, k, T, np.diag(STEP**-2.0)))
+            graph.add_next(keyframe, RelativePose(k - 1, k, T, np.diag((claimed * STEP) ** -2.0)))
     for fix in reference.point_fixes():
         graph.add_point_fix(fix)
     return graph
@@ -241,6 +256,24 @@ def test_one_wrong_target_among_eight_is_named_and_does_not_bend_the_map(flight:
     trusting = GRAPH.model_copy(update={"robust": False})
     believed = replace(reference, left_out=np.zeros_like(reference.left_out))
     assert _error_m(flight, believed, solve(_graph(flight, believed, trusting)).poses).max() > 0.6 * np.linalg.norm(by)
+
+
+def test_an_accelerometer_s_bias_does_not_make_the_map_sag() -> None:
+    """The front end's edges are better than they claim, so that gravity decides how the map hangs between targets."""
+    good = _fly(300, seed=1, noise=0.1)
+    points, seen = _survey(good, count=4, seed=9, checks=False)
+    reference = place_in_grid(points, seen, [good.flown()], config=CONFIG, graph=GRAPH)
+
+    def error_m(config: GraphConfig) -> float:
+        biased = (0.004, 0.004, 1.0)  # a third of a degree, in all keyframes
+        poses = solve(_graph(good, reference, config, claimed=4.0, up=biased)).poses
+        return float(_error_m(good, reference, poses)[10:290].max())
+
+    control = graph_with_control(GRAPH, CONFIG)
+    assert control == GRAPH.model_copy(update={"gravity_sigma_deg": 20.0})
+    # a third of a degree over half of the 80 m between targets is 23 cm; edges hold most of that, not all
+    assert error_m(GRAPH) > 0.05
+    assert error_m(control) < 0.03
 
 
 def test_what_was_left_out_wrongly_is_taken_back(flight: Flight) -> None:
