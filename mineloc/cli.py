@@ -101,9 +101,52 @@ def ingest(
 
 
 @app.command()
+def reconstruct(
+    flights: Annotated[list[Path], typer.Argument(help="Canonical flights through one mine.")],
+    out: Annotated[Path, typer.Option("--out", help="The map folder to write.")],
+    method: Annotated[str, typer.Option("--method", help="Front end and loop closures, as in localize.")] = (
+        "odometry_loops"
+    ),
+    control: Annotated[Path | None, typer.Option("--control", help="Surveyed targets (CSV).")] = None,
+    observations: Annotated[Path | None, typer.Option("--observations", help="Where flights saw them (CSV).")] = None,
+    no_control: Annotated[bool, typer.Option("--no-control", help="Without targets, also attached ones.")] = False,
+    as_json: JsonOption = False,
+    config: ConfigOption = None,
+    overrides: SetOption = None,
+) -> None:
+    """The map of a mine from mapping flights: points, roadways, accuracy. E.g. reconstruct survey.mcap --out map/."""
+    from mineloc.config import load_config
+    from mineloc.stages.progress_bar import progress_bar
+    from mineloc.stages.reconstruct import reconstruct as run_stage
+
+    if no_control and (control or observations):
+        raise typer.BadParameter("either --no-control or targets")
+    settings = load_config(config, overrides or ())
+    with progress_bar("reconstruct") as progress:
+        result = run_stage(
+            flights,
+            out,
+            method=method,
+            control=control,
+            observations=observations,
+            use_control=not no_control,
+            config=settings,
+            progress=progress,
+        )
+    if as_json:
+        sys.stdout.write(json.dumps(result.to_dict(), indent=1, allow_nan=False) + "\n")
+        return
+    from rich.console import Console
+
+    from mineloc.stages.reconstruct_table import reconstruct_table
+
+    Console(highlight=False).print(reconstruct_table(result))
+
+
+@app.command()
 def localize(
     flight: Annotated[Path, typer.Argument(help="A canonical flight (of ingest or simulate).")],
-    method: Annotated[str, typer.Option("--method", help="odometry or loam.")],
+    method: Annotated[str, typer.Option("--method", help="odometry, odometry_loops, loam, loam_scan_context …")],
     out: Annotated[Path, typer.Option("--out", help="The run folder to write.")],
     recording: Annotated[bool, typer.Option(help="Also write run.rrd, what `mineloc view` shows.")] = True,
     as_json: JsonOption = False,

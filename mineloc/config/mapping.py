@@ -83,6 +83,7 @@ class MapConfig(Section):
     """The map as a survey product."""
 
     voxel_m: float = Field(default=0.1, ge=0.02, le=0.5, description="one point a voxel of surface")
+    piece_voxel_m: float = Field(default=0.08, gt=0, description="one point a voxel and keyframe waits for the map")
     max_range_m: float = Field(default=20.0, gt=0, description="farther points do not enter the map")
     range_spread_pm2: float = Field(
         default=0.02, ge=0, description="growth of the range noise along a roadway, a square metre of range"
