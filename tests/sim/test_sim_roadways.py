@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mineloc.errors import FormatError, SimulationError
-from mineloc.roadways.graph import Roadway, RoadwayGraph, read_graph
+from mineloc.errors import SimulationError
+from mineloc.roadways.graph import Roadway, RoadwayGraph
 from mineloc.sim.from_mesh import roadways_of_mesh
 from mineloc.sim.mine import Mine, load_mine, planned_mine
 from mineloc.sim.path import fly_line, mid_height, passable, resample
@@ -163,27 +163,6 @@ def test_tour_of_nothing_is_refused_and_pieces_do_not_hang_it() -> None:
     apart = RoadwayGraph(nodes, (Roadway(0, 1, nodes[:2]), Roadway(2, 3, nodes[2:])))
     tour = plan_tour(apart, 200, np.random.default_rng(0))
     assert {step.roadway for step in tour} == {1}
-
-
-# --- graph files
-
-
-def test_graph_file_is_read_and_damage_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "g.json"
-    raw = {
-        "z_floor": 2.0,
-        "nodes": [{"id": 7, "xy": [0, 0]}, {"id": 9, "xyz": [10, 0, 3]}],
-        "edges": [{"a": 7, "b": 9, "path": [[1, 0], [5, 1, 2.5]]}],
-    }
-    path.write_text(json.dumps(raw))
-    graph = read_graph(path)
-    np.testing.assert_allclose(graph.roadways[0].line_m, [[0, 0, 2], [1, 0, 2], [5, 1, 2.5], [10, 0, 3]])
-    for text in ("", "[]", '{"nodes": [], "edges": []}', json.dumps({**raw, "edges": [{"a": 1, "b": 9, "path": []}]})):
-        path.write_text(text)
-        with pytest.raises(FormatError):
-            read_graph(path)
-    with pytest.raises(FormatError, match="not a roadway graph"):
-        read_graph(tmp_path / "none.json")
 
 
 # --- real meshes
