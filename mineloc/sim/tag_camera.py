@@ -6,7 +6,7 @@ noise. It has a global shutter and no motion blur.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from mineloc import se3
-from mineloc.data import CameraModel
+from mineloc.data import CameraModel, GreyImage
+from mineloc.sim.flight import START_NS, SimulatedFlight
 from mineloc.sim.scene import Scene
-from mineloc.sim.targets import Target
+from mineloc.sim.targets import Target, TargetSurvey
 
 F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
 
@@ -27,6 +29,8 @@ TAG_FAMILY = "tag36h11"
 FARTHEST_M = 7.0
 """Boards farther away are not looked at."""
 
+_NEAREST_M = 0.3
+_GRAZING = 0.2  # cosine of the angle under which a board is not looked at
 _COARSE = 2  # one ray for so many pixels each way: rock is smooth, boards are drawn apart
 _SAMPLES = 4  # of a pixel each way, where boards are drawn
 _ROCK, _BLACK, _WHITE = 0.35, 0.06, 0.85  # albedos
@@ -35,6 +39,7 @@ _LIGHT_M = 2.5  # the lamp's light is down to half here
 _EXPOSURE = 520.0  # grey of a white surface at the lamp
 _BLUR_PX = 0.6
 _NOISE = 3.0
+_PIXELS = 23  # random stream
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,18 +64,23 @@ class TagView:
         return self.tag_size_m * 10.0 / 8.0
 
     def sees_tag(self, T_map_camera: F64) -> Bool:
-        """(n,) whether a board may be in the picture from (n, 4, 4) poses; what hides it is not asked."""
+        """(n,) whether the middle of a tag is in the picture from (n, 4, 4) poses."""
         out = np.zeros(len(T_map_camera), np.bool_)
         back = se3.inverse(T_map_camera)
         camera = self.camera
         for target in self.targets:
             seen = np.einsum("nij,j->ni", back[:, :3, :3], target.position_map) + back[:, :3, 3]
-            x, y, z = seen.T
-            ahead = (z > 0.3) & (np.linalg.norm(seen, axis=1) < FARTHEST_M)
+            away, (x, y, z) = np.linalg.norm(seen, axis=1), seen.T
+            ahead = (z > _NEAREST_M) & (away < FARTHEST_M) & ~out
             z = np.where(ahead, z, 1.0)
             u, v = camera.fx_px * x / z + camera.cx_px, camera.fy_px * y / z + camera.cy_px
-            facing = np.einsum("nij,i->nj", T_map_camera[:, :3, :3], target.T_map_board[:3, 2])[:, 2] > 0.2
-            out |= ahead & facing & (u > 0) & (u < camera.width_px) & (v > 0) & (v < camera.height_px)
+            sight = target.position_map - T_map_camera[:, :3, 3]
+            ahead &= sight @ target.T_map_board[:3, 2] > _GRAZING * away
+            ahead &= (u > 0) & (u < camera.width_px) & (v > 0) & (v < camera.height_px)
+            rows = np.flatnonzero(ahead)
+            if len(rows):
+                free_m = self.scene.ranges_m(T_map_camera[rows, :3, 3], sight[rows] / away[rows, None])
+                out[rows] = free_m > away[rows]
         return out
 
     def picture(self, T_map_camera: F64, rng: np.random.Generator) -> U8:
@@ -145,6 +155,35 @@ class TagView:
         inside &= away < np.repeat(np.repeat(depth_m[part], _SAMPLES, axis=0), _SAMPLES, axis=1)
         covered, seen = _pooled(inside.astype(float)), _pooled(np.where(inside, light, 0.0))
         bright[part] = (1.0 - covered) * bright[part] + seen
+
+
+class TagCamera:
+    """Takes the pictures of a simulated flight that a tag is in; the same whenever they are asked for.
+
+    Args:
+        flight: who flies.
+        survey: its targets.
+        camera: geometry.
+        T_body_camera: (4, 4) of the optical frame.
+        rate_hz: of the camera.
+    """
+
+    def __init__(
+        self, flight: SimulatedFlight, survey: TargetSurvey, camera: CameraModel, T_body_camera: F64, *, rate_hz: float
+    ) -> None:
+        self._seed = flight.config.seed
+        self._view = TagView(flight.mine.scene, camera, survey.targets, flight.config.tag_size_m)
+        stamps = START_NS + (np.arange(1, int(flight.motion.end_s * rate_hz)) * 1e9 / rate_hz).round().astype(np.int64)
+        poses = flight.pose(stamps) @ T_body_camera
+        rows = np.flatnonzero(self._view.sees_tag(poses))
+        self.stamps_ns: I64 = stamps[rows]
+        self._poses: F64 = poses[rows]
+
+    def between(self, begin_ns: int, end_ns: int) -> Iterator[GreyImage]:
+        """The pictures taken in `[begin_ns, end_ns)`, in order of time."""
+        for k in range(*np.searchsorted(self.stamps_ns, [begin_ns, end_ns]).tolist()):
+            rng = np.random.default_rng(np.random.SeedSequence((self._seed, _PIXELS, k)))
+            yield GreyImage(int(self.stamps_ns[k]), self._view.picture(self._poses[k], rng), self._view.camera)
 
 
 @lru_cache(maxsize=64)

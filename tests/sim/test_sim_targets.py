@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 from mineloc import se3
-from mineloc.config import SimulateConfig
+from mineloc.config import ControlConfig, SimulateConfig
+from mineloc.data import Calibration, CameraModel
+from mineloc.mapping.tags import observe_tags
 from mineloc.sim.flight import START_NS, SimulatedFlight
 from mineloc.sim.mine import Mine
+from mineloc.sim.tag_camera import TagCamera
 from mineloc.sim.targets import TargetSurvey, in_sight, survey_of
 
 CONFIG = SimulateConfig(
@@ -137,3 +140,32 @@ def test_the_same_flight_has_the_same_targets_and_without_the_wish_none(demo: Mi
     for a, b in zip(survey.observations, again.observations, strict=True):
         np.testing.assert_array_equal(a.point_lidar, b.point_lidar)
     assert survey_of(SimulatedFlight(demo, SimulateConfig(length_m=20))) is None
+
+
+def test_the_camera_sees_the_tags_that_the_drone_passes(demo: Mine) -> None:
+    """From pictures to observations: nearly every tag is found, where it is."""
+    config = CONFIG.model_copy(update={"length_m": 60, "tags": True})
+    flight = SimulatedFlight(demo, config)
+    survey = survey_of(flight)
+    assert survey is not None
+    T_body_camera = se3.from_rt(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), [0.1, 0.0, 0.0])
+    camera = TagCamera(flight, survey, CameraModel(848, 480, 424.0, 424.0, 423.5, 239.5), T_body_camera, rate_hz=1.0)
+    calibration = Calibration(flight.calibration.T_body_lidar, flight.calibration.T_body_imu, T_body_camera)
+    whole = (START_NS, START_NS + 10**12)
+    seen = observe_tags(camera.between(*whole), survey.points, calibration, ControlConfig(), flight="demo-5")
+    # pictures are taken where a tag is in them alone
+    assert seen.images == len(camera.stamps_ns) < flight.motion.end_s / 2
+    assert seen.used >= seen.images / 3
+    found = {o.target for o in seen.observations}
+    assert found == {target.name for target in survey.targets}
+    assert len(found) >= 2
+    truth = {target.name: target.position_map for target in survey.targets}
+    for observation in seen.observations:
+        T = flight.pose(np.array([observation.stamp_ns]))[0] @ flight.calibration.T_body_lidar
+        off = se3.apply(T, observation.point_lidar[None])[0] - truth[observation.target]
+        assert np.linalg.norm(off) < 0.03
+    middle = int(camera.stamps_ns[len(camera.stamps_ns) // 2])
+    (again,) = camera.between(middle, middle + 1)
+    parts = [*camera.between(START_NS, middle), *camera.between(middle, whole[1])]
+    assert [image.stamp_ns for image in parts] == camera.stamps_ns.tolist()
+    np.testing.assert_array_equal(again.pixels, parts[len(camera.stamps_ns) // 2].pixels)
