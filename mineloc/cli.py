@@ -230,7 +230,7 @@ def report(
 
 @app.command()
 def view(
-    what: Annotated[Path, typer.Argument(help="A run folder, a flight (.mcap), or a recording (.rrd).")],
+    what: Annotated[Path, typer.Argument(help="A run or map folder, a flight (.mcap), or a recording (.rrd).")],
     flight: Annotated[Path | None, typer.Option("--flight", help="The run's flight: its sweeps are shown.")] = None,
     save: Annotated[Path | None, typer.Option("--save", help="Write the recording (.rrd), open no window.")] = None,
     screenshot: Annotated[Path | None, typer.Option("--screenshot", help="Write a picture (.png).")] = None,

@@ -8,12 +8,18 @@ from dataclasses import fields
 from typing import cast
 
 from mineloc.data import F64, FlightInfo
+from mineloc.stages.map_folder import MapFolder
 from mineloc.view.scene import Scene
 
 _SPECIAL = re.compile(r"([\\`*_{}\[\]()<>#+\-!|~&])")
 _LEGEND = """
 White: reference. Orange: online estimate, as known at that time. Coloured line: smoothed estimate, brighter where its
 error is larger. Yellow: current sweep. Green: keyframes; their edges are vermilion where registration was degenerate.
+"""
+
+_MAP_LEGEND = """
+Brown: floor. Grey: walls. Dark: roof (hide it to look inside). Yellow: roadways; orange: intersections; white: ends.
+Blue: the flight. Green: loop closures.
 """
 
 
@@ -43,6 +49,35 @@ def about_flight(info: FlightInfo, health: Mapping[str, object], *, placed_by: s
     findings = [f"- {escaped(str(one['severity']))}: {escaped(str(one['detail']))}" for one in found]
     lines = [f"# {escaped(info.flight or 'unnamed flight')}", "", *(["| | |", "| --- | --- |", *rows] if rows else [])]
     lines += ["", f"Sweeps (yellow) are placed by {placed_by}.", "", *findings]
+    return "\n".join([*lines, *_subtracted(origin_m)])
+
+
+def about_map(survey: MapFolder, origin_m: F64) -> str:
+    """Markdown of a map: where it comes from, how large and how sure it is."""
+    manifest = survey.manifest
+    numbers, loops, control = manifest["map"], manifest["loops"], manifest["control"]
+    flights = "; ".join(f"{escaped(one['name'])}, {one['path_m']:.0f} m" for one in manifest["flights"])
+    complete = numbers["complete_share"]
+    lines = [
+        "# Map",
+        "",
+        f"From {flights}. Front end **{escaped(manifest['front_end'])}**, "
+        f"mineloc {escaped(manifest['mineloc_version'])}.",
+        "",
+        "| | |",
+        "| --- | --- |",
+        f"| points | {numbers['points']:,} |",
+        f"| roadways | {numbers['roadways_m']:,.0f} m, {numbers['intersections']} intersections |",
+        f"| complete | {'unknown' if complete is None else f'{complete:.0%}'} |",
+        f"| loop closures | {loops['accepted']} accepted, {loops['refused']} refused |",
+    ]
+    weak_m = sum(one["degenerate_m"] for one in manifest["flights"])
+    lines += [f"| weakly observed | {weak_m:,.0f} m of the way |"] if weak_m else []
+    for role in ("control", "check"):
+        summary = None if control is None else control[role]
+        if summary is not None:
+            lines.append(f"| {role} points | {summary['count']}, RMSE {summary['rmse_3d_m']:.3f} m |")
+    lines += ["", _MAP_LEGEND.strip().replace("\n", " ")]
     return "\n".join([*lines, *_subtracted(origin_m)])
 
 

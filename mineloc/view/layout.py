@@ -66,6 +66,28 @@ def flight_layout(
     )
 
 
+def map_layout(low_m: F64, high_m: F64) -> rrb.Blueprint:
+    """The layout of a map: the mine without its roof, the facts beside it.
+
+    Args:
+        low_m, high_m: (3,) corners of what the eye shall take in, local origin already subtracted.
+    """
+    mine = rrb.Spatial3DView(
+        origin="map",
+        name="Map",
+        eye_controls=_eye(low_m, high_m),
+        line_grid=False,
+        overrides={"map/roof": rrb.EntityBehavior(visible=False)},
+    )
+    return rrb.Blueprint(
+        rrb.Horizontal(mine, rrb.TextDocumentView(origin="about", name="About"), column_shares=[4, 1]),
+        rrb.TimePanel(state=rrb.PanelState.Hidden),
+        rrb.SelectionPanel(state=rrb.PanelState.Hidden),
+        rrb.BlueprintPanel(state=rrb.PanelState.Collapsed),
+        auto_views=False,
+    )
+
+
 def _eye(low_m: F64, high_m: F64) -> rrb.EyeControls3D:
     """From the south, steep enough that roadways do not hide each other, near enough to fill the view."""
     width, depth, height = np.maximum(high_m - low_m, 1.0).tolist()

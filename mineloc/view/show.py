@@ -11,9 +11,11 @@ from rerun.chunk import RrdReader
 from mineloc.config import Config
 from mineloc.errors import FormatError
 from mineloc.progress import Progress, quiet
+from mineloc.stages.map_folder import MapFolder
 from mineloc.view.flight import record_flight
 from mineloc.view.recorder import TIMELINE
 from mineloc.view.run import record_run
+from mineloc.view.survey_map import record_map
 from mineloc.view.viewer import open_viewer, screenshot
 
 
@@ -30,7 +32,7 @@ def show(
     """Record and show; a window opens only when neither `save` nor `picture` is wanted.
 
     Args:
-        what: a run folder, a canonical flight (.mcap), or a recording (.rrd).
+        what: a run folder, a map folder, a canonical flight (.mcap), or a recording (.rrd).
         flight: the flight of a run, for its sweeps.
         save: where to keep the recording.
         picture: where to write a picture of it, half way through the flight.
@@ -42,7 +44,7 @@ def show(
         The files that were written.
 
     Raises:
-        FormatError: none of the three kinds.
+        FormatError: none of these kinds.
         MinelocError: what recording and viewer say.
     """
     with tempfile.TemporaryDirectory() as folder:
@@ -55,6 +57,8 @@ def show(
 
 
 def _recording(what: Path, flight: Path | None, out: Path, overwrite: bool, config: Config, progress: Progress) -> Path:
+    if what.is_dir() and MapFolder.is_map(what):
+        return record_map(what, out, config=config.view, overwrite=overwrite)
     if what.is_dir():
         return record_run(what, out, flight=flight, config=config, overwrite=overwrite, progress=progress)
     if not what.exists():
@@ -65,7 +69,7 @@ def _recording(what: Path, flight: Path | None, out: Path, overwrite: bool, conf
         return record_flight(what, out, config=config, overwrite=overwrite, progress=progress)
     if what.suffix == ".rrd":
         return what
-    raise FormatError(what, "cannot be shown", expected="a run folder, a flight (.mcap) or a recording (.rrd)")
+    raise FormatError(what, "cannot be shown", expected="a run or map folder, a flight (.mcap) or a recording (.rrd)")
 
 
 def _middle_ns(recording: Path) -> int | None:
