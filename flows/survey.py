@@ -12,6 +12,7 @@ from prefect.utilities.annotations import opaque
 
 from flows.ingest import ingest, simulate
 from flows.localize import evaluate, localize, qa
+from flows.reconstruct import reconstruct
 from flows.report import link, record, report
 from mineloc.errors import MinelocError
 from mineloc.survey.engine import engine
@@ -19,7 +20,7 @@ from mineloc.survey.events import Event
 from mineloc.survey.plan import plan_survey
 from mineloc.survey.spec import read_survey
 
-TASKS = {task.name: task for task in (simulate, ingest, localize, evaluate, record, report)}
+TASKS = {task.name: task for task in (simulate, ingest, reconstruct, localize, evaluate, record, report)}
 
 
 @flow(name="survey", persist_result=False, validate_parameters=False)

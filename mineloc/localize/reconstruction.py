@@ -14,7 +14,7 @@ from mineloc.errors import FlightError
 from mineloc.graph.batch import Solution, solve
 from mineloc.graph.pose_graph import PoseGraph
 from mineloc.graph.spread import spread
-from mineloc.localize.control import GridReference, judge, place_in_grid, residuals
+from mineloc.localize.control import GridReference, graph_with_control, judge, place_in_grid, residuals
 from mineloc.localize.flown import Flown
 from mineloc.localize.loops import LoopCloser
 from mineloc.localize.merging import join_flights
@@ -158,7 +158,7 @@ def _closed(nodes: Sequence[_Node], closer: LoopCloser | None) -> list[RelativeP
 
 
 def _graph(nodes: Sequence[_Node], reference: GridReference | None, config: Config) -> PoseGraph:
-    graph = PoseGraph(config.graph)
+    graph = PoseGraph(config.graph if reference is None else graph_with_control(config.graph, config.control))
     flight = 0
     for node in nodes:
         if node.edge is not None:

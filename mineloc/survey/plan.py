@@ -2,6 +2,7 @@
 
 simulate? -> ingest -> localize (a method) -> evaluate, record
                                            -> report (all runs)
+                     -> reconstruct (a map of some flights)
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from mineloc.config import Config
 from mineloc.stages.stage import Input, Job, Stage
 from mineloc.store.digest import Json
 from mineloc.store.store import Outcome, Store
-from mineloc.survey.registry import EVALUATE, INGEST, LOCALIZE, RECORD, REPORT, SIMULATE
-from mineloc.survey.spec import Flight, Survey
+from mineloc.survey.registry import EVALUATE, INGEST, LOCALIZE, RECONSTRUCT, RECORD, REPORT, SIMULATE
+from mineloc.survey.spec import Flight, Map, Survey
 
 METRICS = "metrics.json"
 RECORDING = "run.rrd"
@@ -142,6 +143,7 @@ def plan_survey(survey: Survey) -> Plan:
             to = f"runs/{flight.name}-{method}"
             steps.extend(_run_steps(flight, method, to))
             runs.append(Run(flight.name, method, survey.out / to))
+    steps.extend(_map_step(one, survey.config) for one in survey.maps)
     localized = tuple(Made(step.name) for step in steps if step.stage is LOCALIZE)
     title: dict[str, Json] = {"title": survey.title} if survey.title else {}
     steps.append(Step("report", "", REPORT, "report", {"runs": localized}, config=survey.config, arguments=title))
@@ -194,6 +196,17 @@ def _run_steps(flight: Flight, method: str, to: str) -> Iterator[Step]:
     )
     seen = run | {"flight": Made(f"{flight.name} ingest")}
     yield Step(f"{flight.name} record {method}", flight.name, RECORD, f"{to}/{RECORDING}", seen, flight.config)
+
+
+def _map_step(one: Map, config: Config) -> Step:
+    inputs: dict[str, Wanted | tuple[Wanted, ...]] = {
+        "flights": tuple(Made(f"{name} ingest") for name in one.flights),
+    }
+    for name, path in (("control", one.control), ("observations", one.observations)):
+        if path is not None:
+            inputs[name] = path
+    to = f"maps/{one.name}"
+    return Step(f"{one.name} reconstruct", "", RECONSTRUCT, to, inputs, config, arguments={"method": one.method})
 
 
 def _group(given: Wanted | tuple[Wanted, ...]) -> tuple[Wanted, ...]:

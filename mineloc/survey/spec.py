@@ -17,6 +17,12 @@ name = "rehearsal"
 mine = "demo"                       # ... or a mine to fly through: built-in name, mesh or plan
 [flight.config.simulate]            # configuration of this flight alone
 length_m = 500
+
+[[map]]                             # a map of some of the flights (of all without the key)
+name = "level-4"
+flights = ["north"]
+control = "survey/targets.csv"      # surveyed targets, and where flights saw them; else what the flights bring
+observations = "survey/seen.csv"
 """
 
 from __future__ import annotations
@@ -47,6 +53,16 @@ class FlightSpec(Section):
     config: dict[str, Any] = Field(default_factory=dict)
 
 
+class MapSpec(Section):
+    """One map of a survey; paths as written in the file."""
+
+    name: str = Field(pattern=rf"^{NAME}$", max_length=100)
+    flights: tuple[str, ...] = ()
+    method: str = "odometry_loops"
+    control: str | None = None
+    observations: str | None = None
+
+
 class SurveySpec(Section):
     """The file as it is written."""
 
@@ -56,6 +72,7 @@ class SurveySpec(Section):
     workers: int = Field(default=2, ge=1, le=64, description="processes at work at the same time")
     config: dict[str, Any] = Field(default_factory=dict)
     flight: tuple[FlightSpec, ...] = Field(min_length=1)
+    map: tuple[MapSpec, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +94,23 @@ class Flight:
 
 
 @dataclass(frozen=True, slots=True)
+class Map:
+    """One map, ready to be planned.
+
+    Attributes:
+        flights: names of flights of the survey, at least one.
+        method: front end and loop closures.
+        control, observations: files; None: what the flights bring.
+    """
+
+    name: str
+    flights: tuple[str, ...]
+    method: str
+    control: Path | None
+    observations: Path | None
+
+
+@dataclass(frozen=True, slots=True)
 class Survey:
     """A survey whose files exist and whose configuration is valid.
 
@@ -93,6 +127,7 @@ class Survey:
     workers: int
     flights: tuple[Flight, ...]
     config: Config
+    maps: tuple[Map, ...] = ()
 
 
 def read_survey(path: Path, overrides: Iterable[str] = (), *, out: Path | None = None) -> Survey:
@@ -108,7 +143,8 @@ def read_survey(path: Path, overrides: Iterable[str] = (), *, out: Path | None =
     """
     spec = validate(SurveySpec, read_toml(path), where=str(path))
     overrides = list(overrides)
-    _refuse_equal_names(path, [flight.name for flight in spec.flight])
+    _refuse_equal_names(path, "flights", [flight.name for flight in spec.flight])
+    _refuse_equal_names(path, "maps", [one.name for one in spec.map])
     flights = tuple(_flight(path, flight, spec.config, overrides) for flight in spec.flight)
     return Survey(
         path=path,
@@ -118,6 +154,7 @@ def read_survey(path: Path, overrides: Iterable[str] = (), *, out: Path | None =
         workers=spec.workers,
         flights=flights,
         config=layered_config([spec.config], overrides, where=str(path)),
+        maps=tuple(_map(path, one, [flight.name for flight in flights]) for one in spec.map),
     )
 
 
@@ -159,13 +196,29 @@ def _existing(survey: Path, where: str, key: str, written: str | None) -> Path |
     return found
 
 
-def _refuse_equal_names(path: Path, names: list[str]) -> None:
+def _map(path: Path, spec: MapSpec, flights: list[str]) -> Map:
+    where = f"{path}: map {spec.name}"
+    for name in spec.flights:
+        if name not in flights:
+            raise ConfigError(
+                where, f"no flight {name!r}", expected=f"one of {', '.join(flights)}", todo="correct the survey"
+            )
+    return Map(
+        name=spec.name,
+        flights=spec.flights or tuple(flights),
+        method=spec.method,
+        control=_existing(path, where, "control", spec.control),
+        observations=_existing(path, where, "observations", spec.observations),
+    )
+
+
+def _refuse_equal_names(path: Path, what: str, names: list[str]) -> None:
     seen: dict[str, str] = {}
     for name in names:
         if slug(name) in seen:
             raise ConfigError(
                 path,
-                f"flights {seen[slug(name)]!r} and {name!r}",
+                f"{what} {seen[slug(name)]!r} and {name!r}",
                 expected="names that differ in letters or digits",
                 todo="rename one",
             )

@@ -11,10 +11,10 @@ from mineloc.config import Config, layered_config
 from mineloc.stages.stage import Input, Job
 from mineloc.store.objects import Ref
 from mineloc.survey.plan import Made, plan_survey
-from mineloc.survey.registry import EVALUATE, INGEST, LOCALIZE, RECORD, REPORT, SIMULATE
-from mineloc.survey.spec import Flight, Survey
+from mineloc.survey.registry import EVALUATE, INGEST, LOCALIZE, RECONSTRUCT, RECORD, REPORT, SIMULATE
+from mineloc.survey.spec import Flight, Map, Survey
 
-STAGES = (SIMULATE, INGEST, LOCALIZE, EVALUATE, RECORD, REPORT)
+STAGES = (SIMULATE, INGEST, RECONSTRUCT, LOCALIZE, EVALUATE, RECORD, REPORT)
 
 
 def flight(name: str, **what: object) -> Flight:
@@ -53,6 +53,17 @@ def test_what_a_flight_brings_along_is_read_where_it_matters():
     plan = plan_survey(survey(flight("f", mine=Path("m.ply"), graph=Path("g.json"))))
     assert plan.step("f simulate").inputs == {"mine": Path("m.ply"), "graph": Path("g.json")}
     assert plan.step("f ingest").inputs == {"recording": Made("f simulate")}
+
+
+def test_a_map_is_made_of_its_flights_and_targets():
+    maps = (Map("m", ("b", "a"), "odometry_loops", Path("t.csv"), None),)
+    plan = plan_survey(replace(survey(flight("a"), flight("b")), maps=maps))
+    step = plan.step("m reconstruct")
+    assert step.needs() == ["b ingest", "a ingest"]
+    assert step.inputs["control"] == Path("t.csv")
+    assert "observations" not in step.inputs
+    assert step.to == "maps/m"
+    assert plan.steps[-1].needs() == ["a localize odometry", "b localize odometry"]
 
 
 def test_the_report_reads_all_runs_in_order():
