@@ -23,6 +23,7 @@ POSITION = ("x", "y", "z")
 NORMALS = ("nx", "ny", "nz")
 KNOWN = (("count", "<i4"), ("visits", "<i4"), ("thickness", "<f4"), ("near", "<f4"), ("surface", "u1"))
 """Measured points, keyframes that saw it, σ across the surface (m), least distance seen from (m), `SurfaceKind`."""
+FARTHEST_M = 1e7
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,14 +128,18 @@ def cloud_of(path: Path, rows: Rows, told: Told) -> MapCloud:
         origin = np.round(positions.mean(axis=0)) if len(rows) else np.zeros(3)
     if not told.relative:
         positions = positions - origin
-    normals = np.zeros((len(rows), 3), np.float32)
-    if set(NORMALS) <= set(names):
-        normals = np.stack([rows[name].astype(np.float32) for name in NORMALS], axis=1)
-    unknown = {"count": 1, "thickness": np.nan, "near": np.nan}
-    known = {
-        name: (rows[name] if name in names else np.full(len(rows), unknown.get(name, 0))).astype(np.dtype(kind))
-        for name, kind in KNOWN
-    }
+    if np.abs(positions).max(initial=0.0) > FARTHEST_M:
+        raise FormatError(path, "points more than 10 000 km apart", expected="a mine", todo="check unit and origin")
+    # columns of other programs may hold what ours cannot
+    with np.errstate(over="ignore", invalid="ignore"):
+        normals = np.zeros((len(rows), 3), np.float32)
+        if set(NORMALS) <= set(names):
+            normals = np.stack([rows[name].astype(np.float32) for name in NORMALS], axis=1)
+        unknown = {"count": 1, "thickness": np.nan, "near": np.nan}
+        known = {
+            name: (rows[name] if name in names else np.full(len(rows), unknown.get(name, 0))).astype(np.dtype(kind))
+            for name, kind in KNOWN
+        }
     return MapCloud(
         origin_m=origin,
         points_m=positions.astype(np.float32),

@@ -7,6 +7,7 @@ in a variable length record of user `mineloc`; the normals stay behind, LAS has 
 
 from __future__ import annotations
 
+import struct
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,8 @@ UNKNOWN_DAY = date(1970, 1, 1)
 _USER, _RECORD = "mineloc", 1
 _EXTRA = [(name, kind) for name, kind in KNOWN if name != "surface"]
 _CHUNK = 1 << 20
+_RECORD_BYTES = 54
+_BEST_COMPRESSION = 1000.0  # points a byte that nobody reaches
 _SYSTEM = "mineloc"
 
 
@@ -94,6 +97,7 @@ def read_laz(path: Path) -> MapCloud:
     Raises:
         FormatError: no such file, not LAS, damaged or cut off.
     """
+    _check_sizes(path)
     try:
         with laspy.open(path) as reader:
             las: Any = reader.read()
@@ -107,6 +111,34 @@ def read_laz(path: Path) -> MapCloud:
         )
     lines = [vlr.record_data.decode("ascii", "replace") for vlr in las.header.vlrs if vlr.user_id == _USER]
     return cloud_of(path, _columns(las), heard(path, "\n".join(lines).splitlines()))
+
+
+def _check_sizes(path: Path) -> None:
+    """Refuse what a damaged header promises before the parser goes looking for it: it believes any number.
+
+    LAS 1.4: offset to the points at 96, number of records 100, record length 105, points 107 (until 1.3) or 247, number
+    of extended records 243.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(375)
+        size = path.stat().st_size
+    except OSError as error:
+        raise FormatError(path, f"cannot be read ({error.strerror})", expected="a LAS or LAZ file") from None
+    if head[:4] != b"LASF" or len(head) < 227:
+        raise FormatError(path, "not a LAS or LAZ file", expected="a cloud", todo="check the file")
+    (offset, records), (length, points) = struct.unpack_from("<II", head, 96), struct.unpack_from("<HI", head, 105)
+    extended = 0
+    if head[25] >= 4 and len(head) == 375:
+        extended, points = struct.unpack_from("<IQ", head, 243)
+    packed = length if head[104] < 128 else 1.0 / _BEST_COMPRESSION
+    if offset > size or records * _RECORD_BYTES > offset or extended * _RECORD_BYTES > size or points * packed > size:
+        raise FormatError(
+            path,
+            f"{size} bytes for {points} points and {records + extended} records",
+            expected="a whole file",
+            todo="copy or export it again",
+        )
 
 
 def _columns(las: Any) -> Any:
