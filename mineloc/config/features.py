@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from mineloc.config.section import Section
@@ -14,6 +16,9 @@ class Link3dConfig(Section):
 class ScanContextConfig(Section):
     """Scan Context descriptors and their search."""
 
+    cell: Literal["max_height", "free_range"] = Field(
+        default="max_height", description="what a cell holds: as published, or how far one sees, which tells roadways"
+    )
     rings: int = Field(default=20, ge=1)
     sectors: int = Field(default=60, ge=3)
     radius_m: float = Field(default=40.0, gt=0, description="80 outdoors; a roadway is seen no farther")
@@ -25,5 +30,7 @@ class ScanContextConfig(Section):
     min_shared_columns: float = Field(
         default=0.3, gt=0, le=1, description="share of the columns that must be filled in both contexts"
     )
-    max_distance: float = Field(default=0.2, ge=0, le=1, description="of two contexts that may be one place")
+    max_distance: float = Field(
+        default=0.2, ge=0, le=1, description="of two contexts that may be one place; about 0.02 with free_range"
+    )
     min_path_m: float = Field(default=30.0, ge=0, description="a place left so short a way ago is not seen again")

@@ -20,19 +20,25 @@ UNLIKE = 1.0
 
 
 def scan_context(points_level: F32 | F64, config: ScanContextConfig) -> F32:
-    """The context of a sweep: the highest point of every cell.
+    """The context of a sweep.
 
-    Cell (r, s) holds the points whose horizontal range is in ring r and whose azimuth is in sector s. Its value is the
-    largest `z + lidar_height_m`, never negative; 0 where there is no point. Sector 0 begins at +x, the others follow
-    counter-clockwise. Points beyond `radius_m`, or not finite, are dropped.
+    Cell (r, s) holds the points whose horizontal range is in ring r and whose azimuth is in sector s. Sector 0 begins
+    at +x, the others follow counter-clockwise. Points that are not finite are dropped. By `cell`:
+
+    - `max_height`, as published: the largest `z + lidar_height_m` in the cell, never negative; 0 where there is no
+      point. Points beyond `radius_m` are dropped. In a mine this is the height of the roof, everywhere.
+    - `free_range`: the share of the cell that lies before the farthest point of its sector, 1 in all rings that one
+      sees across. How far one sees in each direction is what tells one place of a roadway from another.
 
     Args:
         points_level: (n, 3) metres, the lidar at the origin, z up (turned by the measured direction of up).
-        config: `rings`, `sectors`, `radius_m`, `lidar_height_m`.
+        config: `cell`, `rings`, `sectors`, `radius_m`, `lidar_height_m`.
 
     Returns:
         (rings, sectors) float32.
     """
+    if config.cell == "free_range":
+        return _as_free_range(_farthest(points_level, config.sectors), config)
     return _highest(points_level, config.rings, config.sectors, config.radius_m, config.lidar_height_m)
 
 
@@ -85,6 +91,34 @@ def _least_shared(config: ScanContextConfig, sectors: int) -> int:
     return max(1, math.ceil(config.min_shared_columns * sectors))
 
 
+def _as_free_range(far_m: F64, config: ScanContextConfig) -> F32:
+    """(rings, sectors) share of each cell that lies before (sectors,) ranges."""
+    rings = far_m * config.rings / config.radius_m - np.arange(config.rings)[:, None]
+    return np.clip(rings, 0, 1).astype(np.float32)
+
+
+@njit(cache=True, nogil=True)
+def _sector_of(x: float, y: float, sectors: int) -> int:
+    angle = math.atan2(y, x)
+    if angle < 0.0:
+        angle += 2.0 * math.pi
+    # an angle just below zero can round up to a whole turn
+    return min(int(angle * sectors / (2.0 * math.pi)), sectors - 1)
+
+
+@njit(cache=True, nogil=True)
+def _farthest(points: F32 | F64, sectors: int) -> F64:
+    """(sectors,) horizontal range of the farthest point, 0 without one."""
+    out = np.zeros(sectors)
+    for i in range(len(points)):
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        away = math.hypot(x, y)
+        if away < np.inf and abs(z) < np.inf:
+            sector = _sector_of(x, y, sectors)
+            out[sector] = max(out[sector], away)
+    return out
+
+
 @njit(cache=True, nogil=True)
 def _highest(points: F32 | F64, rings: int, sectors: int, radius_m: float, height_m: float) -> F32:
     out = np.zeros((rings, sectors), np.float32)
@@ -93,11 +127,7 @@ def _highest(points: F32 | F64, rings: int, sectors: int, radius_m: float, heigh
         away = math.hypot(x, y)
         if not (away < radius_m and abs(z) < np.inf):
             continue
-        angle = math.atan2(y, x)
-        if angle < 0.0:
-            angle += 2.0 * math.pi
-        # an angle just below zero can round up to a whole turn
-        sector = min(int(angle * sectors / (2.0 * math.pi)), sectors - 1)
+        sector = _sector_of(x, y, sectors)
         ring = min(int(away * rings / radius_m), rings - 1)
         out[ring, sector] = max(out[ring, sector], np.float32(z + height_m))
     return out
@@ -158,17 +188,21 @@ def _column_distance(a: F32, b: F32, norm_a: F64, norm_b: F64, shift: int, least
 
 
 def scan_context_plainly(points_level: F32 | F64, config: ScanContextConfig) -> F32:
-    """`scan_context` in plain numpy: what the kernel is held to."""
+    """`scan_context` in plain numpy: what the kernels are held to."""
     points = points_level.astype(np.float64)
+    points = points[np.isfinite(points).all(axis=1)]
     away = np.hypot(points[:, 0], points[:, 1])
-    kept = (away < config.radius_m) & np.isfinite(points[:, 2])
-    points, away = points[kept], away[kept]
     angle = np.arctan2(points[:, 1], points[:, 0])
     angle += np.where(angle < 0, 2 * np.pi, 0.0)
     sector = np.minimum((angle * config.sectors / (2 * np.pi)).astype(np.int64), config.sectors - 1)
+    if config.cell == "free_range":
+        far = np.zeros(config.sectors)
+        np.maximum.at(far, sector, away)
+        return _as_free_range(far, config)
+    kept = away < config.radius_m
     ring = np.minimum((away * config.rings / config.radius_m).astype(np.int64), config.rings - 1)
     out = np.zeros((config.rings, config.sectors))
-    np.maximum.at(out, (ring, sector), points[:, 2] + config.lidar_height_m)
+    np.maximum.at(out, (ring[kept], sector[kept]), points[kept, 2] + config.lidar_height_m)
     return out.astype(np.float32)
 
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -20,6 +21,8 @@ from mineloc.places.scan_context import (
     yaw_of_shift,
 )
 
+Cell = Literal["max_height", "free_range"]
+CELLS: tuple[Cell, ...] = ("max_height", "free_range")
 CONFIG = ScanContextConfig()
 
 
@@ -62,9 +65,15 @@ def room_seen_from(x_m: float, y_m: float, yaw_rad: float) -> F64:
 
 
 @settings(deadline=None, max_examples=40)
-@given(seed=st.integers(0, 10_000), n=st.integers(0, 500), rings=st.integers(1, 30), sectors=st.integers(3, 90))
-def test_the_context_kernel_agrees_with_plain_numpy(seed: int, n: int, rings: int, sectors: int) -> None:
-    config = ScanContextConfig(rings=rings, sectors=sectors, lidar_height_m=1.0)
+@given(
+    seed=st.integers(0, 10_000),
+    n=st.integers(0, 500),
+    rings=st.integers(1, 30),
+    sectors=st.integers(3, 90),
+    cell=st.sampled_from(CELLS),
+)
+def test_the_context_kernels_agree_with_plain_numpy(seed: int, n: int, rings: int, sectors: int, cell: Cell) -> None:
+    config = ScanContextConfig(rings=rings, sectors=sectors, lidar_height_m=1.0, cell=cell)
     found, plain = scan_context(cloud(seed, n), config), scan_context_plainly(cloud(seed, n), config)
     assert found.shape == (rings, sectors)
     assert found.dtype == np.float32
@@ -84,11 +93,11 @@ def test_the_distance_kernel_agrees_with_plain_numpy(one: int, other: int, fille
 
 
 @settings(deadline=None, max_examples=30)
-@given(seed=st.integers(0, 10_000), n=st.integers(0, 500))
-def test_the_order_of_the_points_does_not_matter(seed: int, n: int) -> None:
-    points = cloud(seed, n)
+@given(seed=st.integers(0, 10_000), n=st.integers(0, 500), cell=st.sampled_from(CELLS))
+def test_the_order_of_the_points_does_not_matter(seed: int, n: int, cell: Cell) -> None:
+    points, config = cloud(seed, n), ScanContextConfig(cell=cell)
     order = np.random.default_rng(seed).permutation(n)
-    assert np.array_equal(scan_context(points, CONFIG), scan_context(points[order], CONFIG))
+    assert np.array_equal(scan_context(points, config), scan_context(points[order], config))
 
 
 @settings(deadline=None, max_examples=30)
@@ -110,18 +119,29 @@ def test_cells_are_where_the_definition_puts_them() -> None:
     assert filled == {(0, 0): 6.0, (1, 14): 3.0, (2, 30): 1.5, (19, 59): 2.3}
 
 
+def test_free_range_is_the_share_of_a_cell_before_the_farthest_point() -> None:
+    config = ScanContextConfig(cell="free_range", rings=4, sectors=4, radius_m=8.0)
+    # 2 m rings, quadrants: 3 m and less in the first, 5 m in the second, beyond the radius in the third
+    points = np.array([[3 * math.cos(0.5), 3 * math.sin(0.5), -1], [1, 1, 5], [0, 5, 9], [-50, -1, 0], [np.nan, -1, 0]])
+    expected = [[1, 1, 1, 0], [0.5, 1, 1, 0], [0, 0.5, 1, 0], [0, 0, 1, 0]]
+    assert scan_context(points, config) == pytest.approx(np.array(expected))
+
+
+@pytest.mark.parametrize("cell", CELLS)
 @pytest.mark.parametrize("yaw_deg", [10.0, 90.0, 175.0, -60.0, -117.0])
-def test_the_yaw_takes_the_query_to_the_match(yaw_deg: float) -> None:
-    yaw = math.radians(yaw_deg)
+def test_the_yaw_takes_the_query_to_the_match(yaw_deg: float, cell: Cell) -> None:
+    yaw, config = math.radians(yaw_deg), ScanContextConfig(cell=cell)
     query, match = room_seen_from(1.0, -0.5, yaw), room_seen_from(1.2, -0.4, 0.0)
-    distance, shift = context_distance(scan_context(query, CONFIG), scan_context(match, CONFIG), CONFIG)
-    assert distance < CONFIG.max_distance
-    found = yaw_of_shift(shift, CONFIG.sectors)
+    distance, shift = context_distance(scan_context(query, config), scan_context(match, config), config)
+    assert distance < config.max_distance
+    found = yaw_of_shift(shift, config.sectors)
     # half a sector, and what 0.2 m turn at the nearest wall (4 m)
     assert abs(math.remainder(found - yaw, 2 * math.pi)) < math.radians(3.0 + 3.0)
     c, s = math.cos(found), math.sin(found)
     turned = query @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-    assert np.median(np.abs(scan_context(turned, CONFIG) - scan_context(match, CONFIG))) < 0.05
+    again = context_distance(scan_context(turned, config), scan_context(match, config), config)
+    assert again[0] < config.max_distance
+    assert again[1] in (0, 1, config.sectors - 1)  # nothing is left to turn
 
 
 def test_yaw_is_within_half_a_turn() -> None:
