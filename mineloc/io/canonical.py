@@ -210,10 +210,12 @@ def decode_poses(messages: Sequence[bytes | memoryview], layout: CdrLayout, *, p
 
 
 def encode_calibration(calibration: Calibration, stamp_ns: int) -> bytes | memoryview:
-    """The /tf_static message: `lidar` and `imu` placed in `body`."""
+    """The /tf_static message: `lidar`, `imu` and, if there is one, `camera` placed in `body`."""
     types = STORE.types
+    placed = [("lidar", calibration.T_body_lidar), ("imu", calibration.T_body_imu)]
+    placed += [] if calibration.T_body_camera is None else [("camera", calibration.T_body_camera)]
     transforms: list[Any] = []
-    for child, T in (("lidar", calibration.T_body_lidar), ("imu", calibration.T_body_imu)):
+    for child, T in placed:
         t, q = se3.to_xyzw(T)
         header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](*stamp_parts(stamp_ns)), "body")
         transform = types["geometry_msgs/msg/Transform"](

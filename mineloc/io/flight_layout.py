@@ -5,9 +5,12 @@
 | `/lidar/points` | PointCloud2 | sweeps; logged at the time of their last point |
 | `/imu` | Imu | one message a sample |
 | `/tf` | TFMessage | reference as `map` → `body`, at most 50 Hz |
-| `/tf_static` | TFMessage | `body` → `lidar`, `body` → `imu` |
+| `/tf_static` | TFMessage | `body` → `lidar`, `body` → `imu`, `body` → `camera` if there is one |
 | `/pose` | PoseStamped | reference, every pose |
 | `/odom` | Odometry | odometry that came with the recording: `body` in `odom` |
+| `/camera/depth/image` | Image | 16UC1: millimetres along the optical axis, 0 where unknown |
+| `/camera/grey/image` | CompressedImage | JPEG |
+| `/camera/…/camera_info` | CameraInfo | geometry, once, at the time of the first image |
 """
 
 from __future__ import annotations
@@ -31,12 +34,18 @@ TF = "/tf"
 TF_STATIC = "/tf_static"
 POSE = "/pose"
 ODOM = "/odom"
+DEPTH = "/camera/depth/image"
+DEPTH_INFO = "/camera/depth/camera_info"
+GREY = "/camera/grey/image"
+GREY_INFO = "/camera/grey/camera_info"
 
 FLIGHT_RECORD = "mineloc.flight"
 HEALTH_RECORD = "mineloc.health"
 SCHEMA = "mineloc.flight/1"
 # Channel metadata of /lidar/points: the nominal duration of a revolution.
 PERIOD_KEY = "period_ns"
+# Channel metadata of images: the geometry of their camera.
+CAMERA_KEY = "camera"
 
 MAP, BODY, ODOM_FRAME = "map", "body", "odom"
 F64 = NDArray[np.float64]
@@ -58,6 +67,8 @@ def encode_info(info: FlightInfo, calibration: Calibration, *, first_ns: int, la
     record["schema"] = SCHEMA
     record["T_body_lidar"] = json.dumps(calibration.T_body_lidar.tolist())
     record["T_body_imu"] = json.dumps(calibration.T_body_imu.tolist())
+    if calibration.T_body_camera is not None:
+        record["T_body_camera"] = json.dumps(calibration.T_body_camera.tolist())
     record["first_ns"], record["last_ns"] = str(first_ns), str(last_ns)
     record["checksum"] = _checksum(record)
     return record
@@ -77,7 +88,10 @@ def decode_info(path: Path, record: Mapping[str, str]) -> tuple[FlightInfo, Cali
     if record.get("checksum") != _checksum(rest):
         raise IngestError(path, "the mineloc.flight record is damaged", todo="run mineloc ingest again")
     info = FlightInfo(**{f.name: record.get(f.name, "") for f in fields(FlightInfo)})
-    calibration = Calibration(_matrix(record["T_body_lidar"]), _matrix(record["T_body_imu"]))
+    camera = record.get("T_body_camera")
+    calibration = Calibration(
+        _matrix(record["T_body_lidar"]), _matrix(record["T_body_imu"]), None if camera is None else _matrix(camera)
+    )
     return info, calibration, int(record["first_ns"]), int(record["last_ns"])
 
 

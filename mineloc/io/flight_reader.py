@@ -12,14 +12,14 @@ from typing import cast
 import numpy as np
 from mcap.records import Channel
 
-from mineloc.data import Calibration, FlightInfo, ImuSamples, Sweep, Trajectory
+from mineloc.data import Calibration, DepthImage, FlightInfo, GreyImage, ImuSamples, Sweep, Trajectory
 from mineloc.errors import FlightError, IngestError
-from mineloc.io import canonical
+from mineloc.io import camera_images, canonical
 from mineloc.io import flight_layout as layout
 from mineloc.io.background import prefetched
 from mineloc.io.cdr_layout import CdrLayout
 from mineloc.io.mcap_chunks import RawRecord, ordered_messages, read_attachment, read_summary
-from mineloc.io.ros import IMU, ODOMETRY, POINT_CLOUD2, POSE_STAMPED
+from mineloc.io.ros import COMPRESSED_IMAGE, IMAGE, IMU, ODOMETRY, POINT_CLOUD2, POSE_STAMPED
 
 # Decoded this far ahead of the consumer: a few megabytes.
 _AHEAD = 4
@@ -28,7 +28,9 @@ _PORTION = 2000
 # A sweep waits this long for inertial samples that do not come.
 _PATIENCE_NS = 300_000_000
 
-_Item = Sweep | RawRecord
+_Decoded = Sweep | DepthImage | GreyImage
+_Item = _Decoded | RawRecord
+_DECODED = {layout.POINTS: POINT_CLOUD2, layout.DEPTH: IMAGE, layout.GREY: COMPRESSED_IMAGE}
 
 
 class FlightReader:
@@ -39,7 +41,7 @@ class FlightReader:
         info: who flew what, where and when.
         calibration: where the sensors sit.
         health: what ingest found out; empty when it was not ingested (simulated).
-        sweep_count: number of sweeps.
+        sweep_count, depth_count, grey_count: number of sweeps, depth images and grey images.
         first_ns, last_ns: times of the first and the last measurement.
 
     Raises:
@@ -80,8 +82,9 @@ class FlightReader:
         health = records.get(layout.HEALTH_RECORD, {}).get("json", "{}")
         self.health = cast("dict[str, object]", json.loads(health))
         self._summary = summary
-        counts = summary.statistics.channel_message_counts if summary.statistics else {}
-        self.sweep_count = sum(counts.get(c.id, 0) for c in self._channels(layout.POINTS))
+        self.sweep_count = self._count(layout.POINTS)
+        self.depth_count = self._count(layout.DEPTH)
+        self.grey_count = self._count(layout.GREY)
 
     def __enter__(self) -> FlightReader:
         return self
@@ -107,12 +110,33 @@ class FlightReader:
             FlightError: a sweep does not start later than the one before.
             IngestError: a damaged chunk.
         """
-        for item in prefetched(self._items(layout.POINTS, start_ns=start_ns, end_ns=end_ns), depth=_AHEAD):
-            sweep = cast("Sweep", item)
-            if end_ns is not None and sweep.stamp_ns >= end_ns:
+        return cast("Generator[Sweep]", self._between(layout.POINTS, start_ns, end_ns))
+
+    def depth_images(self, start_ns: int | None = None, end_ns: int | None = None) -> Generator[DepthImage]:
+        """The depth images taken in `[start_ns, end_ns)`, read ahead by a background thread; none without a camera.
+
+        Raises:
+            FlightError: an image is not later than the one before.
+            IngestError: a damaged chunk.
+        """
+        return cast("Generator[DepthImage]", self._between(layout.DEPTH, start_ns, end_ns))
+
+    def grey_images(self, start_ns: int | None = None, end_ns: int | None = None) -> Generator[GreyImage]:
+        """The grey images taken in `[start_ns, end_ns)`, read ahead by a background thread; none without a camera.
+
+        Raises:
+            FlightError: an image is not later than the one before.
+            IngestError: a damaged chunk.
+        """
+        return cast("Generator[GreyImage]", self._between(layout.GREY, start_ns, end_ns))
+
+    def _between(self, topic: str, start_ns: int | None, end_ns: int | None) -> Generator[_Decoded]:
+        for item in prefetched(self._items(topic, start_ns=start_ns, end_ns=end_ns), depth=_AHEAD):
+            decoded = cast("_Decoded", item)
+            if end_ns is not None and decoded.stamp_ns >= end_ns:
                 return
-            if start_ns is None or sweep.stamp_ns >= start_ns:
-                yield sweep
+            if start_ns is None or decoded.stamp_ns >= start_ns:
+                yield decoded
 
     def imu(self) -> ImuSamples:
         """All inertial samples.
@@ -161,7 +185,7 @@ class FlightReader:
         held: deque[Sweep] = deque()
         samples: list[RawRecord] = []
         felt_ns = -1  # time of the latest sample
-        for item in self._items(layout.POINTS, layout.IMU_TOPIC):
+        for item in cast("Generator[Sweep | RawRecord]", self._items(layout.POINTS, layout.IMU_TOPIC)):
             now_ns = item.end_ns if isinstance(item, Sweep) else item.log_ns
             while held and now_ns > held[0].end_ns + _PATIENCE_NS:
                 yield held.popleft(), self._decode_imu(samples)
@@ -198,8 +222,12 @@ class FlightReader:
     def _channels(self, topic: str) -> list[Channel]:
         return [c for c in self._summary.channels.values() if c.topic == topic]
 
+    def _count(self, topic: str) -> int:
+        counts = self._summary.statistics.channel_message_counts if self._summary.statistics else {}
+        return sum(counts.get(c.id, 0) for c in self._channels(topic))
+
     def _items(self, *topics: str, start_ns: int | None = None, end_ns: int | None = None) -> Generator[_Item]:
-        """Messages of the topics in order of log time, sweeps decoded."""
+        """Messages of the topics in order of log time, sweeps and images decoded."""
         channels = {c.id: c for topic in topics for c in self._channels(topic)}
         chunks = [
             index
@@ -210,8 +238,8 @@ class FlightReader:
         last_ns: dict[str, int] = {}
         for record in ordered_messages(self.path, chunks, channels):
             channel = channels[record.channel]
-            item = self._decode_sweep(record, channel) if channel.topic == layout.POINTS else record
-            now_ns = item.stamp_ns if isinstance(item, Sweep) else item.log_ns
+            item = self._decoded(record, channel)
+            now_ns = item.log_ns if isinstance(item, RawRecord) else item.stamp_ns
             before_ns = last_ns.get(channel.topic)
             if before_ns is not None and now_ns <= before_ns:
                 raise self._disorder(channel.topic, before_ns, now_ns)
@@ -231,12 +259,18 @@ class FlightReader:
         if portion:
             yield portion
 
-    def _decode_sweep(self, record: RawRecord, channel: Channel) -> Sweep:
+    def _decoded(self, record: RawRecord, channel: Channel) -> _Item:
+        topic, facts = channel.topic, channel.metadata
+        if topic not in _DECODED:
+            return record
         try:
-            period_ns = int(channel.metadata[layout.PERIOD_KEY])
-            return canonical.decode_sweep(record.data, period_ns=period_ns)
+            if topic == layout.POINTS:
+                return canonical.decode_sweep(record.data, period_ns=int(facts[layout.PERIOD_KEY]))
+            camera = camera_images.camera_of_json(facts[layout.CAMERA_KEY])
+            decode = camera_images.decode_depth if topic == layout.DEPTH else camera_images.decode_grey
+            return decode(record.data, camera)
         except Exception as error:
-            raise self._foreign(layout.POINTS, POINT_CLOUD2) from error
+            raise self._foreign(topic, _DECODED[topic]) from error
 
     def _decode_imu(self, records: list[RawRecord]) -> ImuSamples:
         if not records:

@@ -1,8 +1,9 @@
-"""Writing a canonical flight: sweeps, inertial samples, reference, facts."""
+"""Writing a canonical flight: sweeps, inertial samples, images, reference, facts."""
 
 from __future__ import annotations
 
 import json
+from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -15,12 +16,22 @@ from mcap.records import Attachment
 from numpy.typing import NDArray
 
 from mineloc import __version__
-from mineloc.data import Calibration, FlightInfo, ImuSamples, Sweep, Trajectory
+from mineloc.data import Calibration, CameraModel, DepthImage, FlightInfo, GreyImage, ImuSamples, Sweep, Trajectory
 from mineloc.errors import FlightError
-from mineloc.io import canonical
+from mineloc.io import camera_images, canonical
 from mineloc.io import flight_layout as layout
 from mineloc.io.mcap_writer import McapWriter
-from mineloc.io.ros import IMU, ODOMETRY, POINT_CLOUD2, POSE_STAMPED, TF_MESSAGE, definition
+from mineloc.io.ros import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    IMU,
+    ODOMETRY,
+    POINT_CLOUD2,
+    POSE_STAMPED,
+    TF_MESSAGE,
+    definition,
+)
 from mineloc.output import new_file
 
 I64 = NDArray[np.int64]
@@ -29,6 +40,9 @@ U8 = NDArray[np.uint8]
 # Viewers need no more; every pose is in /pose.
 _TF_PERIOD_NS = 20_000_000
 _CLOUDS, _REST = "clouds", "rest"
+_LATCHED = (layout.TF_STATIC, layout.DEPTH_INFO, layout.GREY_INFO)
+# Encoded images that may wait for the sweeps: a few megabytes.
+_MOST_IMAGES = 16
 
 
 @dataclass(slots=True)
@@ -41,12 +55,23 @@ class _Pending:
     done: int = 0
 
 
+@dataclass(frozen=True, slots=True)
+class _Picture:
+    """An encoded image that waits until the sweeps have come as far."""
+
+    stamp_ns: int
+    channel: int
+    topic: str
+    data: memoryview
+
+
 class FlightWriter:
     """Writes one flight file; nothing appears at `path` unless the `with` block ends without an error.
 
     Sweeps must come in order of time. Inertial samples and poses may come before, between or after the sweeps, in any
     portions, each in order; they are kept (unencoded) until the sweeps have reached their time, so that the file is in
-    order of time. The same calls give the same bytes.
+    order of time. Images are kept encoded, and only so many that memory does not grow: add them near their sweeps.
+    The same calls give the same bytes.
 
     Args:
         path: the file to make.
@@ -78,8 +103,9 @@ class FlightWriter:
         self._overwrite = overwrite
         self._stack = ExitStack()
         self._mcap: McapWriter | None = None
-        self._channels: dict[tuple[str, int], int] = {}
+        self._channels: dict[tuple[str, str], int] = {}
         self._pending: list[_Pending] = []
+        self._pictures: deque[_Picture] = deque()
         self._attachments: list[Attachment] = []
         self._health: Mapping[str, object] | None = None
         self._last_ns: dict[str, int] = {}
@@ -148,7 +174,7 @@ class FlightWriter:
         """Append a sweep that is encoded already, exactly as `canonical.encode_sweep` does it."""
         self._check_order(layout.POINTS, np.array([stamp_ns]))
         self._emit_until(end_ns)
-        channel = self._channel(layout.POINTS, POINT_CLOUD2, period_ns=period_ns)
+        channel = self._channel(layout.POINTS, POINT_CLOUD2, {layout.PERIOD_KEY: str(period_ns)} if period_ns else {})
         self._open_mcap.add_message(channel, end_ns, data, publish_ns=publish_ns, group=_CLOUDS)
         self._extend(stamp_ns, end_ns)
 
@@ -188,6 +214,41 @@ class FlightWriter:
         made = canonical.odometry_layout(layout.ODOM_FRAME, layout.BODY)
         self._add_poses(odometry, layout.ODOM, ODOMETRY, made)
 
+    def add_depth(self, image: DepthImage) -> None:
+        """Append a depth image, later than the one before; its depths are rounded to millimetres.
+
+        Raises:
+            FlightError: it is taken no later than the image before.
+            ValueError: the calibration does not place the camera, or a time that cannot be written.
+        """
+        self._add_image(image.stamp_ns, image.camera, layout.DEPTH, IMAGE, camera_images.encode_depth(image))
+
+    def add_grey(self, image: GreyImage) -> None:
+        """Append a grey image, later than the one before; JPEG changes its pixels a little.
+
+        Raises:
+            FlightError: it is taken no later than the image before.
+            ValueError: the calibration does not place the camera, or a time that cannot be written.
+        """
+        self._add_image(image.stamp_ns, image.camera, layout.GREY, COMPRESSED_IMAGE, camera_images.encode_grey(image))
+
+    def _add_image(self, stamp_ns: int, camera: CameraModel, topic: str, msgtype: str, data: U8) -> None:
+        if self._calibration.T_body_camera is None:
+            raise ValueError("images need a calibration with T_body_camera")
+        stamps = np.array([stamp_ns], np.int64)
+        self._check_order(topic, stamps)
+        geometry = camera_images.camera_json(camera)
+        first = (topic, geometry) not in self._channels
+        channel = self._channel(topic, msgtype, {layout.CAMERA_KEY: geometry})
+        if first:
+            info = camera_images.encode_camera_info(camera, stamp_ns)[None]
+            about = layout.DEPTH_INFO if topic == layout.DEPTH else layout.GREY_INFO
+            self._wait(self._channel(about, CAMERA_INFO), stamps, lambda part: info[part])
+        self._pictures.append(_Picture(stamp_ns, channel, topic, data.data))
+        self._extend(stamp_ns, stamp_ns)
+        if len(self._pictures) > _MOST_IMAGES:
+            self._put_picture(self._pictures.popleft())
+
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
         """Attach a file (calibration, control points). A name may be used once."""
         if any(a.name == name for a in self._attachments):
@@ -204,14 +265,14 @@ class FlightWriter:
             channel = self._channel(topic, msgtype)
             self._wait(channel, poses.stamps_ns, lambda part: canonical.encode_poses(_pose_part(poses, part), made))
 
-    def _channel(self, topic: str, msgtype: str, *, period_ns: int = 0) -> int:
-        channel = self._channels.get((topic, period_ns))
+    def _channel(self, topic: str, msgtype: str, facts: Mapping[str, str] | None = None) -> int:
+        """The channel of a topic and one set of facts about its messages, told in its metadata."""
+        key = topic, "".join((facts or {}).values())
+        channel = self._channels.get(key)
         if channel is None:
-            metadata = {"offered_qos_profiles": layout.qos_profiles(latched=topic == layout.TF_STATIC)}
-            if period_ns:
-                metadata[layout.PERIOD_KEY] = str(period_ns)
+            metadata = {"offered_qos_profiles": layout.qos_profiles(latched=topic in _LATCHED), **(facts or {})}
             channel = self._open_mcap.add_channel(topic, msgtype, definition(msgtype), metadata)
-            self._channels[topic, period_ns] = channel
+            self._channels[key] = channel
         return channel
 
     def _check_order(self, topic: str, stamps_ns: I64) -> None:
@@ -236,8 +297,9 @@ class FlightWriter:
 
     def _emit_until(self, end_ns: int | None) -> None:
         """Write the pending messages up to a time (all of them for None), in order of time."""
-        if (layout.TF_STATIC, 0) not in self._channels:
+        if (layout.TF_STATIC, "") not in self._channels:
             self._emit_calibration(end_ns)
+        self._put_pictures(end_ns)
         ready: list[tuple[int, I64, U8]] = []
         for batch in self._pending:
             stop = len(batch.stamps_ns)
@@ -260,6 +322,16 @@ class FlightWriter:
         due.sort(key=lambda message: message[:2])
         for stamp_ns, channel, message in due:
             self._open_mcap.add_message(channel, stamp_ns, message, group=_REST)
+
+    def _put_pictures(self, end_ns: int | None) -> None:
+        due = [p for p in self._pictures if end_ns is None or p.stamp_ns <= end_ns]
+        for picture in sorted(due, key=lambda p: p.stamp_ns):
+            self._put_picture(picture)
+        self._pictures = deque(p for p in self._pictures if end_ns is not None and p.stamp_ns > end_ns)
+
+    def _put_picture(self, picture: _Picture) -> None:
+        # chunks of their own: who reads sweeps does not unpack them
+        self._open_mcap.add_message(picture.channel, picture.stamp_ns, picture.data, group=picture.topic)
 
     def _emit_calibration(self, end_ns: int | None) -> None:
         starts = [int(batch.stamps_ns[0]) for batch in self._pending]
