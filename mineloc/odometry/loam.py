@@ -36,13 +36,29 @@ more."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Track:
+class Track:
     """The last sweep that features were taken from: where the next one starts."""
 
     stamp_ns: int
     T_odom_lidar: F64
     twist_lidar: F64
     features: LoamFeatures
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Aid:
+    """What is known of a sweep before it is registered.
+
+    Attributes:
+        features: deskewed to the end of the sweep.
+        T_last_lidar: (4, 4) assumed motion since the last sweep.
+        constraints: points that belong to lines or planes of the last sweep, in its lidar frame; None without. They
+            join the registrations to the last sweep and to the map.
+    """
+
+    features: LoamFeatures
+    T_last_lidar: F64
+    constraints: Matches | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,6 +76,8 @@ class LoamFrontEnd:
 
     A-LOAM's `T_map_odom`, the correction kept from one map registration to the next, is part of the pose: the motion
     from sweep to sweep is appended to the last mapped pose.
+
+    A front end that knows more of a sweep than LOAM overrides `_extract` and `_aid`.
     """
 
     def __init__(self, config: LoamConfig, keyframe: KeyframeConfig) -> None:
@@ -69,7 +87,7 @@ class LoamFrontEnd:
         search_m = config.neighbour_distance_m
         self._corners = FeatureMap(leaf_m=config.corner_leaf_m, search_m=search_m, reach_m=_REACH_M)
         self._surfaces = FeatureMap(leaf_m=config.surface_leaf_m, search_m=search_m, reach_m=_REACH_M)
-        self._track: _Track | None = None
+        self._track: Track | None = None
         self._start_ns: int | None = None
         self._end_ns = 0
         self._coasted_s = 0.0
@@ -81,20 +99,27 @@ class LoamFrontEnd:
             FlightError: time goes backwards, or the sweep has no rings.
         """
         end_ns = self._end_of(sweep)
-        features = extract_features(sweep, self._config)
+        features = self._extract(sweep)
         last = self._track
         if last is None:
             return self._begin(sweep, features, end_ns)
-        T_last_lidar = self._predict(last, end_ns)
-        features = features.deskewed(last.twist_lidar, target_ns=end_ns)
-        odometry = self._sweep_to_sweep(last, features, T_last_lidar)
-        guess = se3.rigid(last.T_odom_lidar @ T_last_lidar) if odometry is None else odometry.T_odom_lidar
-        registration = self._sweep_to_map(features, guess) or odometry
+        aid = self._aid(last, features.deskewed(last.twist_lidar, target_ns=end_ns), end_ns)
+        odometry = self._sweep_to_sweep(last, aid)
+        guess = se3.rigid(last.T_odom_lidar @ aid.T_last_lidar) if odometry is None else odometry.T_odom_lidar
+        registration = self._sweep_to_map(last, aid, guess) or odometry
         if registration is None:
-            return self._coast(last, features, guess, end_ns)
-        self._extend_map(features, registration.T_odom_lidar)
-        self._track = _follow(last, registration.T_odom_lidar, features, end_ns)
+            return self._coast(last, aid.features, guess, end_ns)
+        self._extend_map(aid.features, registration.T_odom_lidar)
+        self._track = _follow(last, registration.T_odom_lidar, aid.features, end_ns)
         return self._report(sweep, registration, self._track, last.twist_lidar)
+
+    def _extract(self, sweep: Sweep) -> LoamFeatures:
+        """The features of a sweep, not deskewed."""
+        return extract_features(sweep, self._config)
+
+    def _aid(self, last: Track, features: LoamFeatures, end_ns: int) -> Aid:
+        """What is known of the sweep just extracted, deskewed by the motion before: LOAM trusts in constant velocity."""
+        return Aid(features, self._predict(last, end_ns))
 
     def _end_of(self, sweep: Sweep) -> int:
         """The time for which this sweep's pose will be true: its last point, later than all before."""
@@ -123,18 +148,18 @@ class LoamFrontEnd:
         if lack:
             return OdometryStep(end_ns, np.eye(4), trusted=False, reason=f"{lack}; the flight has not begun")
         features = features.deskewed(np.zeros(6), target_ns=end_ns)
-        self._track = _Track(end_ns, np.eye(4), np.zeros(6), features)
+        self._track = Track(end_ns, np.eye(4), np.zeros(6), features)
         self._extend_map(features, np.eye(4))
         return self._report(sweep, None, self._track, np.zeros(6))
 
-    def _predict(self, last: _Track, end_ns: int) -> F64:
+    def _predict(self, last: Track, end_ns: int) -> F64:
         """Constant velocity; a drone unseen for longer than `max_prediction_s` counts as hovering from then on."""
         elapsed_s = min((end_ns - last.stamp_ns) * 1e-9, self._config.max_prediction_s)
         return se3.exp(elapsed_s * last.twist_lidar)
 
-    def _sweep_to_sweep(self, last: _Track, features: LoamFeatures, T_last_lidar: F64) -> _Registration | None:
+    def _sweep_to_sweep(self, last: Track, aid: Aid) -> _Registration | None:
         """Sharp to less sharp, flat to less flat points of the last sweep; None with too few matches."""
-        config = self._config
+        config, features = self._config, aid.features
         within = {"distance_m": config.odometry_distance_m, "rings": config.odometry_rings}
         if _lack(features, config):
             return None
@@ -143,7 +168,8 @@ class LoamFrontEnd:
                 match_lines(features.sharp, last.features.less_sharp, T, **within),
                 match_planes(features.flat, last.features.less_flat, T, **within),
             ),
-            T_last_lidar,
+            aid.T_last_lidar,
+            constraints=aid.constraints,
             points=len(features.sharp) + len(features.flat),
             at_least=config.odometry_min_matches,
             rounds=config.odometry_rounds,
@@ -153,9 +179,9 @@ class LoamFrontEnd:
         )
         return None if found is None else replace(found, T_odom_lidar=se3.rigid(last.T_odom_lidar @ found.T_odom_lidar))
 
-    def _sweep_to_map(self, features: LoamFeatures, guess: F64) -> _Registration | None:
+    def _sweep_to_map(self, last: Track, aid: Aid, guess: F64) -> _Registration | None:
         """Thinned less sharp and less flat points to the lines and planes of the map; None with too few matches."""
-        config = self._config
+        config, features = self._config, aid.features
         corners = voxel_centroids(features.less_sharp.points_lidar, config.corner_leaf_m)
         surfaces = voxel_centroids(features.less_flat.points_lidar, config.surface_leaf_m)
         return _register(
@@ -164,6 +190,7 @@ class LoamFrontEnd:
                 self._surfaces.match_planes(surfaces, T, tolerance_m=config.plane_tolerance_m),
             ),
             guess,
+            constraints=None if aid.constraints is None else aid.constraints.placed(last.T_odom_lidar),
             points=len(corners) + len(surfaces),
             at_least=config.mapping_min_matches,
             rounds=config.mapping_rounds,
@@ -180,18 +207,16 @@ class LoamFrontEnd:
             thinned = se3.apply(T_odom_lidar, voxel_centroids(points, leaf_m))
             target.add(thinned.astype(np.float32), T_odom_lidar[:3, 3])
 
-    def _coast(self, last: _Track, features: LoamFeatures, T_odom_lidar: F64, end_ns: int) -> OdometryStep:
+    def _coast(self, last: Track, features: LoamFeatures, T_odom_lidar: F64, end_ns: int) -> OdometryStep:
         """The prior carries on. A sweep with features becomes the one to match next, unconnected to those before."""
         lack = _lack(features, self._config)
         if not lack:
             self._coasted_s += (end_ns - last.stamp_ns) * 1e-9
-            self._track = _Track(end_ns, T_odom_lidar, last.twist_lidar, features)
+            self._track = Track(end_ns, T_odom_lidar, last.twist_lidar, features)
         reason = lack or "too few points match the last sweep or the map"
         return OdometryStep(end_ns, T_odom_lidar, trusted=False, reason=f"{reason}; constant velocity")
 
-    def _report(
-        self, sweep: Sweep, registration: _Registration | None, track: _Track, twist_lidar: F64
-    ) -> OdometryStep:
+    def _report(self, sweep: Sweep, registration: _Registration | None, track: Track, twist_lidar: F64) -> OdometryStep:
         """What the step says of itself, with a keyframe and its relative pose when one is due."""
         keyframe, relative, degeneracy = None, None, None
         hessian = np.zeros((6, 6))
@@ -228,6 +253,7 @@ def _register(
     match: Callable[[F64], Matches],
     T: F64,
     *,
+    constraints: Matches | None,
     points: int,
     at_least: int,
     rounds: int,
@@ -235,23 +261,26 @@ def _register(
     huber_m: float,
     min_eigenvalue: float,
 ) -> _Registration | None:
-    """Match and solve in turn; None as soon as there are fewer matches than `at_least`."""
+    """Match and solve in turn, always with the constraints; None with fewer matches than `at_least` without them."""
     found: _Registration | None = None
     for _ in range(rounds):
         matches = match(T)
         if len(matches) < at_least:
             return None
+        if constraints is not None:
+            matches = Matches.join(matches, constraints)
         T, residual_m = solve(matches, T, iterations=iterations, huber_m=huber_m, min_eigenvalue=min_eigenvalue)
-        found = _Registration(T, matches, residual_m, points)
+        asked = points if constraints is None else points + len(constraints)
+        found = _Registration(T, matches, residual_m, asked)
     return found
 
 
-def _follow(last: _Track, T_odom_lidar: F64, features: LoamFeatures, end_ns: int) -> _Track:
+def _follow(last: Track, T_odom_lidar: F64, features: LoamFeatures, end_ns: int) -> Track:
     """The track after a registered sweep, with the velocity that led from the last pose to this one."""
     elapsed_s = (end_ns - last.stamp_ns) * 1e-9
     moved = se3.log(se3.inverse(last.T_odom_lidar) @ T_odom_lidar)
     twist = last.twist_lidar if elapsed_s < _SHORTEST_STEP_S else moved / elapsed_s
-    return _Track(end_ns, T_odom_lidar, twist, features)
+    return Track(end_ns, T_odom_lidar, twist, features)
 
 
 def _lack(features: LoamFeatures, config: LoamConfig) -> str:

@@ -6,7 +6,7 @@ the Jacobians of METHOD D3 (right perturbation, rotation first).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,10 @@ class Matches:
 
     def __len__(self) -> int:
         return len(self.points_lidar)
+
+    def placed(self, T_other_target: F64) -> Matches:
+        """The same lines and planes in another frame."""
+        return replace(self, anchors=se3.apply(T_other_target, self.anchors), axes=self.axes @ T_other_target[:3, :3].T)
 
     @staticmethod
     def join(lines: Matches, planes: Matches) -> Matches:
