@@ -118,7 +118,7 @@ class LoamFrontEnd:
         return extract_features(sweep, self._config)
 
     def _aid(self, last: Track, features: LoamFeatures, end_ns: int) -> Aid:
-        """What is known of the sweep just extracted, deskewed by the motion before: LOAM trusts in constant velocity."""
+        """What is known of the sweep just extracted, deskewed by the motion before: here constant velocity."""
         return Aid(features, self._predict(last, end_ns))
 
     def _end_of(self, sweep: Sweep) -> int:
