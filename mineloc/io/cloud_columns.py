@@ -119,7 +119,8 @@ def cloud_of(path: Path, rows: Rows, told: Told) -> MapCloud:
     names = rows.dtype.names or ()
     if not set(POSITION) <= set(names):
         raise FormatError(path, f"columns {', '.join(names)}", expected="x, y, z", todo="this is no cloud")
-    positions = np.stack([rows[name].astype(np.float64) for name in POSITION], axis=1)
+    with np.errstate(invalid="ignore"):  # a signalling NaN
+        positions = np.stack([rows[name].astype(np.float64) for name in POSITION], axis=1)
     if not np.isfinite(positions).all():
         raise FormatError(path, "positions that are not finite", expected="numbers", todo="remove those points")
     if told.origin_m is not None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import laspy
 import numpy as np
@@ -27,7 +27,8 @@ _USER, _RECORD = "mineloc", 1
 _EXTRA = [(name, kind) for name, kind in KNOWN if name != "surface"]
 _CHUNK = 1 << 20
 _RECORD_BYTES = 54
-_BEST_COMPRESSION = 1000.0  # points a byte that nobody reaches
+_CHUNK_BYTES = 20  # a chunk begins with a whole point
+_BEST_COMPRESSION = 100.0  # points a byte that nobody reaches
 _SYSTEM = "mineloc"
 
 
@@ -99,10 +100,14 @@ def read_laz(path: Path) -> MapCloud:
     """
     _check_sizes(path)
     try:
-        with laspy.open(path) as reader:
+        # the parallel backend believes the sizes of chunks and gathers them all first
+        with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader:
             las: Any = reader.read()
             expected = reader.header.point_count
-    except Exception as error:  # noqa: BLE001  # hostile files: whatever a parser says leaves as one kind of error
+            rows = _columns(las)
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException as error:  # noqa: BLE001  # hostile files: a panic of the decoder is no Exception
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise FormatError(path, f"cannot be read as LAS or LAZ ({reason})", todo="copy or export it again") from None
     if len(las.points) != expected:
@@ -110,7 +115,7 @@ def read_laz(path: Path) -> MapCloud:
             path, f"ends after {len(las.points)} of {expected} points", expected="a whole file", todo="copy it again"
         )
     lines = [vlr.record_data.decode("ascii", "replace") for vlr in las.header.vlrs if vlr.user_id == _USER]
-    return cloud_of(path, _columns(las), heard(path, "\n".join(lines).splitlines()))
+    return cloud_of(path, rows, heard(path, "\n".join(lines).splitlines()))
 
 
 def _check_sizes(path: Path) -> None:
@@ -120,9 +125,10 @@ def _check_sizes(path: Path) -> None:
     of extended records 243.
     """
     try:
+        size = path.stat().st_size
         with path.open("rb") as file:
             head = file.read(375)
-        size = path.stat().st_size
+            chunks = _chunks(file, head, size)
     except OSError as error:
         raise FormatError(path, f"cannot be read ({error.strerror})", expected="a LAS or LAZ file") from None
     if head[:4] != b"LASF" or len(head) < 227:
@@ -132,7 +138,8 @@ def _check_sizes(path: Path) -> None:
     if head[25] >= 4 and len(head) == 375:
         extended, points = struct.unpack_from("<IQ", head, 243)
     packed = length if head[104] < 128 else 1.0 / _BEST_COMPRESSION
-    if offset > size or records * _RECORD_BYTES > offset or extended * _RECORD_BYTES > size or points * packed > size:
+    promised = (records * _RECORD_BYTES, extended * _RECORD_BYTES, points * packed, chunks * _CHUNK_BYTES)
+    if offset > size or promised[0] > offset or max(promised) > size:
         raise FormatError(
             path,
             f"{size} bytes for {points} points and {records + extended} records",
@@ -141,6 +148,19 @@ def _check_sizes(path: Path) -> None:
         )
 
 
+def _chunks(file: BinaryIO, head: bytes, size: int) -> int:
+    """How many chunks the table of a LAZ file promises; 0 for LAS."""
+    if len(head) < 227 or head[104] < 128:
+        return 0
+    file.seek(struct.unpack_from("<I", head, 96)[0])
+    (table,) = struct.unpack("<q", file.read(8).ljust(8, b"\xff"))
+    if not 0 <= table <= size - 8:
+        return size
+    file.seek(table + 4)
+    return struct.unpack("<I", file.read(4))[0]
+
+
+@np.errstate(over="ignore", invalid="ignore")
 def _columns(las: Any) -> Any:
     names = set(las.point_format.extra_dimension_names)
     extra = [(name, kind) for name, kind in _EXTRA if name in names]
