@@ -36,7 +36,9 @@ def _root() -> None:  # pyright: ignore[reportUnusedFunction]  # typer keeps sub
 
 @app.command()
 def simulate(
-    mine: Annotated[str, typer.Argument(help="Mesh (.ply .obj .stl .dae), plan (.toml .dxf), or demo|straight|loop.")],
+    mine: Annotated[
+        str, typer.Argument(help="Mesh (.ply .obj .stl .dae), plan (.toml .dxf), or demo|straight|loop|hall.")
+    ],
     out: Annotated[Path, typer.Option("--out", help="The flight file to write (.mcap).")],
     length_m: Annotated[float | None, typer.Option("--length-m", help="Path length of the tour.")] = None,
     speed_mps: Annotated[float | None, typer.Option("--speed-mps", help="On straight roadways.")] = None,

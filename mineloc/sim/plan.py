@@ -1,4 +1,4 @@
-"""Mine plans: centre-lines with widths and heights, from TOML or from code, and the roadway graph that they make.
+"""Mine plans: centre-lines with widths and heights, rooms and pillars, from TOML or from code; their roadway graph.
 
 name = "north panel"
 [roughness]
@@ -9,6 +9,12 @@ width_m = 4.5
 height_m = 3.5
 [[roadway]]
 points_m = [[60, 0, 0.5], [60, 40, 0.5]]            # begins on the other: an intersection
+[[room]]
+centre_m = [60, 50, 0.5]                            # widens the second; where one flies, roadways alone say
+length_m = 24
+width_m = 16
+[[pillar]]
+centre_m = [55, 47, 0.5]
 """
 
 from __future__ import annotations
@@ -60,6 +66,28 @@ class RoadwayPlan(Section):
         return np.concatenate([points, points[:1]]) if self.closed else points
 
 
+class BoxPlan(Section):
+    """An upright box on the floor."""
+
+    centre_m: tuple[float, float, float]
+    length_m: float = Field(ge=0.3, le=200)
+    width_m: float = Field(ge=0.3, le=200)
+    height_m: float = Field(default=4.0, ge=0.3, le=30)
+    heading_deg: float = Field(default=0.0, ge=-360, le=360, description="of the length, counter-clockwise from x")
+
+
+class RoomPlan(BoxPlan):
+    """Free space with a flat roof: a hall, an engine room, a niche in a wall. Where one flies, roadways alone say."""
+
+
+class PillarPlan(BoxPlan):
+    """What was left standing in free space; one lower than the roof is a bench or a machine."""
+
+    length_m: float = Field(default=0.8, ge=0.3, le=200)
+    width_m: float = Field(default=0.8, ge=0.3, le=200)
+    height_m: float = Field(default=30.0, ge=0.3, le=30)
+
+
 class MinePlan(Section):
     """A mine as somebody draws it: roadways meet where their lines cross or end on one another."""
 
@@ -68,6 +96,8 @@ class MinePlan(Section):
     cell_m: float = Field(default=0.2, ge=0.1, le=0.5, description="resolution of the surface")
     roughness: RoughnessPlan = RoughnessPlan()
     roadway: tuple[RoadwayPlan, ...] = Field(min_length=1)
+    room: tuple[RoomPlan, ...] = ()
+    pillar: tuple[PillarPlan, ...] = ()
 
 
 def read_plan(path: Path) -> MinePlan:
@@ -186,7 +216,12 @@ def _node(nodes: list[F64], point_m: F64, reach_m: float, level_gap_m: float) ->
 
 
 def roadway(
-    points_m: Sequence[tuple[float, float, float]], *, width_m: float = 4.0, height_m: float = 3.2, closed: bool = False
+    points_m: Sequence[tuple[float, float, float]],
+    *,
+    width_m: float = 4.0,
+    height_m: float = 3.2,
+    arch: float = 0.35,
+    closed: bool = False,
 ) -> RoadwayPlan:
     """One roadway, shorter to write."""
-    return RoadwayPlan(points_m=tuple(points_m), width_m=width_m, height_m=height_m, closed=closed)
+    return RoadwayPlan(points_m=tuple(points_m), width_m=width_m, height_m=height_m, arch=arch, closed=closed)

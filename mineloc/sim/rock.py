@@ -1,25 +1,27 @@
 """The surface of a planned mine: profiles swept along centre-lines, joined, roughened, and turned into triangles.
 
-The rock is a signed distance that is negative in the free space: the union of all roadways is the least of their
-distances, so intersections open by themselves. The field is sampled in blocks near the centre-lines only and meshed
-with surface nets (Gibson, *Constrained elastic surface nets*, 1998): one vertex a cell that the surface passes, at the
-mean of the crossings of its edges; one quadrilateral an edge.
+The rock is a signed distance that is negative in the free space: the union of all roadways and rooms is the least of
+their distances, so intersections open by themselves; pillars are taken out of it. The field is sampled in blocks near
+centre-lines and rooms only and meshed with surface nets (Gibson, *Constrained elastic surface nets*, 1998): one vertex
+a cell that the surface passes, at the mean of the crossings of its edges; one quadrilateral an edge.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mineloc.compiled import njit
-from mineloc.sim.plan import MinePlan
+from mineloc.sim.plan import BoxPlan, MinePlan
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 BLOCK = 24
+FOOT_M = 1.0
 FINE_CELLS = 2.5
 # standard deviation of one octave of the lattice noise below, measured over 10⁶ points
 NOISE_SIGMA = 0.270
@@ -27,17 +29,24 @@ NOISE_SIGMA = 0.270
 
 def rock_mesh(plan: MinePlan) -> tuple[F64, I64]:
     """Vertices (n, 3) and triangles (m, 3) of a plan's surface, closed, wound to face the free space."""
-    segments = _segments(plan)
-    blocks = _blocks(segments, plan)
+    segments, rooms, pillars = _segments(plan), _boxes(plan.room), _boxes(plan.pillar)
+    blocks = _blocks(segments, rooms, plan)
     octaves = _octaves(plan)
     keys: list[I64] = []
     vertices: list[F64] = []
     quads: list[I64] = []
     for block in blocks:
-        low = block * BLOCK * plan.cell_m
-        near = _near(segments, low, BLOCK * plan.cell_m)
+        low, size = block * BLOCK * plan.cell_m, BLOCK * plan.cell_m
         field = _field(
-            segments[near], octaves, block * BLOCK - 1, BLOCK + 2, plan.cell_m, plan.roughness.floor, plan.seed
+            segments[_near(segments, low, size)],
+            rooms[_box_near(rooms, low, size)],
+            pillars[_box_near(pillars, low, size)],
+            octaves,
+            block * BLOCK - 1,
+            BLOCK + 2,
+            plan.cell_m,
+            plan.roughness.floor,
+            plan.seed,
         )
         key, vertex, quad = _surface_nets(field, block * BLOCK - 1, plan.cell_m)
         keys.append(key)
@@ -59,6 +68,15 @@ def _segments(plan: MinePlan) -> F64:
     return np.array(rows)
 
 
+def _boxes(plans: Sequence[BoxPlan]) -> F64:
+    """(k, 8) rows `[x y z half-length half-width height cos sin]`."""
+    rows = np.empty((len(plans), 8))
+    for row, box in zip(rows, plans, strict=True):
+        heading = np.deg2rad(box.heading_deg)
+        row[:] = *box.centre_m, box.length_m / 2, box.width_m / 2, box.height_m, np.cos(heading), np.sin(heading)
+    return rows
+
+
 def _octaves(plan: MinePlan) -> F64:
     """(k, 2) rows `[wavelength, amplitude]`: octaves of equal slope between the longest and the shortest, and fine."""
     rough = plan.roughness
@@ -74,8 +92,8 @@ def _margin(plan: MinePlan) -> float:
     return 4 * float(np.hypot(rough.wall_m, rough.fine_m)) + 3 * plan.cell_m
 
 
-def _blocks(segments: F64, plan: MinePlan) -> I64:
-    """(k, 3) indices of the blocks that any roadway may reach into, sorted."""
+def _blocks(segments: F64, rooms: F64, plan: MinePlan) -> I64:
+    """(k, 3) indices of the blocks that any roadway or room may reach into, sorted."""
     size = BLOCK * plan.cell_m
     margin = _margin(plan)
     found: list[I64] = []
@@ -86,10 +104,25 @@ def _blocks(segments: F64, plan: MinePlan) -> I64:
         step = np.abs(b - a) / (count - 1)
         low = np.floor((points - np.array([half, half, 0.0]) - margin - step) / size).astype(np.int64)
         high = np.floor((points + np.array([half, half, height]) + margin + step) / size).astype(np.int64)
-        for one, other in zip(low, high, strict=True):
-            axes = [np.arange(one[k], other[k] + 1) for k in range(3)]
-            found.append(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
+        found += [_between(one, other) for one, other in zip(low, high, strict=True)]
+    for row in rooms:
+        reach = _reach(row)
+        low = row[:3] - np.append(reach, 0.0) - margin
+        high = row[:3] + np.append(reach, row[5]) + margin
+        found.append(_between(np.floor(low / size).astype(np.int64), np.floor(high / size).astype(np.int64)))
     return np.unique(np.concatenate(found), axis=0)
+
+
+def _between(low: I64, high: I64) -> I64:
+    """(k, 3) all indices from `low` to `high`, both included."""
+    axes = [np.arange(low[k], high[k] + 1) for k in range(3)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _reach(box: F64) -> F64:
+    """(2,) half extents along x and y of a turned box."""
+    c, s = abs(box[6]), abs(box[7])
+    return np.array([c * box[3] + s * box[4], s * box[3] + c * box[4]])
 
 
 def _near(segments: F64, low_m: F64, size_m: float) -> NDArray[np.bool_]:
@@ -101,8 +134,26 @@ def _near(segments: F64, low_m: F64, size_m: float) -> NDArray[np.bool_]:
     return np.all((box_low <= low_m + size_m) & (box_high >= low_m), axis=1)
 
 
+def _box_near(boxes: F64, low_m: F64, size_m: float) -> NDArray[np.bool_]:
+    """As `_near`, for rooms and pillars."""
+    reach = np.array([_reach(row) for row in boxes]).reshape(-1, 2) + 2.0
+    low = boxes[:, :3] - np.column_stack([reach, np.full(len(boxes), 2.0 + FOOT_M)])
+    high = boxes[:, :3] + np.column_stack([reach, boxes[:, 5] + 2.0])
+    return np.all((low <= low_m + size_m) & (high >= low_m), axis=1)
+
+
 @njit(cache=True)
-def _field(segments: F64, octaves: F64, first: I64, count: int, cell: float, floor: float, seed: int) -> F64:
+def _field(
+    segments: F64,
+    rooms: F64,
+    pillars: F64,
+    octaves: F64,
+    first: I64,
+    count: int,
+    cell: float,
+    floor: float,
+    seed: int,
+) -> F64:
     """(count, count, count) signed distance to the rock at grid points, roughness included."""
     out = np.full((count, count, count), 10.0)
     # farther from the profile than this, roughness cannot bring the surface here
@@ -115,7 +166,8 @@ def _field(segments: F64, octaves: F64, first: I64, count: int, cell: float, flo
             y = (first[1] + j) * cell
             for k in range(count):
                 z = (first[2] + k) * cell
-                value, near_floor = _union(segments, x, y, z)
+                value, near_floor = _union(segments, rooms, x, y, z)
+                value = max(value, -_solid(pillars, x, y, z))
                 if abs(value) < reach:
                     rough = 0.0
                     for o in range(len(octaves)):
@@ -127,8 +179,8 @@ def _field(segments: F64, octaves: F64, first: I64, count: int, cell: float, flo
 
 
 @njit(cache=True)
-def _union(segments: F64, x: float, y: float, z: float) -> tuple[float, float]:
-    """Signed distance to the nearest roadway's surface, and 0 on its floor … 1 half a metre above it."""
+def _union(segments: F64, rooms: F64, x: float, y: float, z: float) -> tuple[float, float]:
+    """Signed distance to the surface of the nearest roadway or room, and 0 on its floor … 1 half a metre above it."""
     best, above = 10.0, 1.0
     for s in range(len(segments)):
         ux, uy = segments[s, 3] - segments[s, 0], segments[s, 4] - segments[s, 1]
@@ -140,7 +192,32 @@ def _union(segments: F64, x: float, y: float, z: float) -> tuple[float, float]:
         if value < best:
             best = value
             above = min(max(2.0 * up, 0.0), 1.0)
+    for r in range(len(rooms)):
+        up = z - rooms[r, 2]
+        value = max(_rectangle(rooms[r], x, y), -up, up - rooms[r, 5])
+        if value < best:
+            best = value
+            above = min(max(2.0 * up, 0.0), 1.0)
     return best, above
+
+
+@njit(cache=True)
+def _solid(pillars: F64, x: float, y: float, z: float) -> float:
+    """Signed distance to the nearest pillar, negative in it; they stand deeper than any floor is uneven."""
+    best = 10.0
+    for p in range(len(pillars)):
+        up = z - pillars[p, 2]
+        best = min(best, max(_rectangle(pillars[p], x, y), -FOOT_M - up, up - pillars[p, 5]))
+    return best
+
+
+@njit(cache=True)
+def _rectangle(box: F64, x: float, y: float) -> float:
+    """Signed distance in plan to a turned rectangle."""
+    px, py = x - box[0], y - box[1]
+    along = abs(box[6] * px + box[7] * py) - box[3]
+    side = abs(box[6] * py - box[7] * px) - box[4]
+    return np.hypot(max(along, 0.0), max(side, 0.0)) + min(max(along, side), 0.0)
 
 
 @njit(cache=True)

@@ -123,7 +123,7 @@ def test_dxf_without_lines_or_not_at_all_is_refused(tmp_path: Path) -> None:
 
 
 def test_unknown_mine_is_refused() -> None:
-    with pytest.raises(SimulationError, match="demo, straight, loop"):
+    with pytest.raises(SimulationError, match="demo, straight, loop, hall"):
         load_mine("nowhere")
 
 
