@@ -8,11 +8,14 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from mineloc.errors import MinelocError
+
+if TYPE_CHECKING:
+    from mineloc.config import EvaluateConfig
 
 app = typer.Typer(
     name="mineloc",
@@ -186,6 +189,9 @@ def evaluate(
         Literal["none", "origin", "posyaw", "se3"] | None,
         typer.Option("--align", help="One alignment; without it none, origin and se3 are shown."),
     ] = None,
+    baseline: Annotated[
+        str | None, typer.Option("--baseline", help="What the estimate is to beat: the table tells before and after.")
+    ] = None,
     as_json: JsonOption = False,
     config: ConfigOption = None,
     overrides: SetOption = None,
@@ -195,6 +201,9 @@ def evaluate(
     from mineloc.stages.evaluate import evaluate as run
 
     section = load_config(config, overrides or ()).evaluate
+    if baseline is not None:
+        _before_after(estimate, baseline, reference, align=align, section=section, as_json=as_json)
+        return
     evaluation = run(estimate, reference, align=align, config=section)
     if as_json:
         sys.stdout.write(json.dumps(evaluation.to_dict(), indent=1, allow_nan=False) + "\n")
@@ -208,6 +217,33 @@ def evaluate(
         console.print(line, soft_wrap=True, markup=False)
     for table in tables(evaluation):
         console.print(table)
+
+
+def _before_after(
+    estimate: str,
+    baseline: str,
+    reference: str | None,
+    *,
+    align: Literal["none", "origin", "posyaw", "se3"] | None,
+    section: EvaluateConfig,
+    as_json: bool,
+) -> None:
+    from mineloc.stages.before_after import evaluate_before_after
+
+    both = evaluate_before_after(estimate, baseline, reference, align=align, config=section)
+    if as_json:
+        sys.stdout.write(json.dumps(both.to_dict(), indent=1, allow_nan=False) + "\n")
+        return
+    from rich.console import Console
+
+    from mineloc.stages.evaluation_table import before_after_heading, before_after_lines, before_after_table
+
+    console = Console(highlight=False)
+    for line in before_after_heading(both):
+        console.print(line, soft_wrap=True, markup=False)
+    console.print(before_after_table(both))
+    for line in before_after_lines(both):
+        console.print(line, soft_wrap=True, markup=False)
 
 
 @app.command()

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from rich.table import Table
 
 from mineloc.metrics.statistics import Statistics
+from mineloc.stages.before_after import BeforeAfter
 from mineloc.stages.evaluate import Evaluation
 from mineloc.stages.scores import Scores
 
@@ -15,13 +16,53 @@ _NOTHING = "-"
 
 def heading(evaluation: Evaluation) -> list[str]:
     """What was compared, how the poses were paired and how much of the reference that covers, line by line."""
-    lines = [f"estimate   {evaluation.estimate}", f"reference  {evaluation.reference}"]
+    return [f"estimate   {evaluation.estimate}", f"reference  {evaluation.reference}", *_facts(evaluation, "")]
+
+
+def before_after_heading(both: BeforeAfter) -> list[str]:
+    """As `heading`, of baseline and estimate."""
+    return [
+        f"before     {both.before.estimate}",
+        f"after      {both.after.estimate}",
+        f"reference  {both.after.reference}",
+        *_facts(both.before, "before, "),
+        *_facts(both.after, "after, "),
+    ]
+
+
+def before_after_table(both: BeforeAfter) -> Table:
+    """Paper B's tables 1 and 2 in one: statistics of the translation error in metres, before and after."""
+    table = _table("absolute error (APE) in metres")
+    for name in ("", "trajectory", "aligned"):
+        table.add_column(name)
+    for name in ("max", "min", "mean", "rmse", "std", "coverage"):
+        table.add_column(name, justify="right")
+    for one in both.changes:
+        for when, name, t, covered in (
+            ("before", one.baseline_trajectory, one.before_m, one.before_coverage),
+            ("after", one.trajectory, one.after_m, one.after_coverage),
+        ):
+            numbers = (_number(x, 4) for x in (t.max, t.min, t.mean, t.rmse, t.std))
+            table.add_row(when, name, one.alignment, *numbers, f"{covered:.1%}")
+    return table
+
+
+def before_after_lines(both: BeforeAfter) -> list[str]:
+    """The change of each rmse, a line each."""
+    return [
+        f"{one.trajectory}, {one.alignment}: rmse {_number(one.before_m.rmse, 4)} -> {_number(one.after_m.rmse, 4)} m, "
+        + ("no error before" if one.rmse_percent is None else f"{one.rmse_percent:+.1f} %")
+        for one in both.changes
+    ]
+
+
+def _facts(evaluation: Evaluation, prefix: str) -> Iterator[str]:
     if evaluation.trusted_share is not None:
-        lines.append(f"trusted    {evaluation.trusted_share:.1%} of the sweeps")
+        yield f"{prefix + 'trusted':<10} {evaluation.trusted_share:.1%} of the sweeps"
     for scores in evaluation.scores:
-        lines += [f"{scores.name}: {_pairing(scores)}; {_covered(scores)}"]
-        lines += [f"{scores.name}: {note}" for note in scores.notes]
-    return lines + list(evaluation.notes)
+        yield f"{prefix}{scores.name}: {_pairing(scores)}; {_covered(scores)}"
+        yield from (f"{prefix}{scores.name}: {note}" for note in scores.notes)
+    yield from evaluation.notes
 
 
 def tables(evaluation: Evaluation) -> list[Table]:
@@ -52,18 +93,24 @@ def _table(title: str) -> Table:
 
 
 def _absolute(evaluation: Evaluation) -> Table:
-    table = _table("absolute error (APE)")
+    table = _table("absolute error (APE) in metres and degrees")
     table.add_column("trajectory")
     table.add_column("aligned")
-    for name in ("rmse m", "mean m", "median m", "std m", "max m", "rmse °", "max °"):
+    for name in ("rmse", "mean", "median", "std", "min", "max", "rmse °", "max °"):
         table.add_column(name, justify="right")
     for scores in evaluation.scores:
         for one in scores.aligned:
             t, r = one.absolute.translation_m, one.absolute.rotation_deg
-            numbers = [t.rmse, t.mean, t.median, t.std, t.max]
-            angles = [f"{r.rmse:.2f}", f"{r.max:.2f}"]
-            table.add_row(scores.name, one.absolute.alignment, *(f"{x:.3f}" for x in numbers), *angles)
+            metres = (_number(x, 3) for x in (t.rmse, t.mean, t.median, t.std, t.min, t.max))
+            angles = (f"{r.rmse:.2f}", f"{r.max:.2f}")
+            table.add_row(scores.name, one.absolute.alignment, *metres, *angles)
     return table
+
+
+def _number(value: float, decimals: int) -> str:
+    """So many decimals below 10, and no wider above: the columns must fit."""
+    whole = len(f"{value:.0f}")
+    return f"{value:.{max(decimals + 1 - whole, 1)}f}"
 
 
 def _pieces(evaluation: Evaluation) -> Table:
