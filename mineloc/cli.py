@@ -49,6 +49,7 @@ def simulate(
     sensor: Annotated[Literal["vlp16", "rs16", "hdl32e", "os0"] | None, typer.Option("--sensor")] = None,
     start: Annotated[int | None, typer.Option("--start", help="Node of the roadway graph to start from.")] = None,
     graph: Annotated[Path | None, typer.Option("--graph", help="Roadways of a mesh as JSON; else found in it.")] = None,
+    camera: Annotated[bool, typer.Option("--camera", help="With a depth camera that looks ahead.")] = False,
     as_json: JsonOption = False,
     config: ConfigOption = None,
     overrides: SetOption = None,
@@ -59,6 +60,7 @@ def simulate(
     from mineloc.stages.simulate import simulate as run_stage
 
     options = {"length_m": length_m, "speed_mps": speed_mps, "seed": seed, "sensor": sensor}
+    options["camera"] = "true" if camera else None
     given = [f"simulate.{key}={value}" for key, value in options.items() if value is not None]
     settings = load_config(config, [*(overrides or ()), *given])
     with progress_bar("simulate") as progress:

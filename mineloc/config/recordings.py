@@ -62,3 +62,13 @@ class SimulateConfig(Section):
     grid_yaw_deg: float = Field(default=0.0, description="of the map's x axis in the mine grid, from east to north")
     tags: bool = Field(default=False, description="targets are AprilTags, and a grey camera sees them")
     tag_size_m: float = Field(default=0.3, ge=0.05, le=2, description="edge of a tag's black square")
+    camera: bool = Field(default=False, description="the drone carries a depth camera (D435) that looks ahead")
+    camera_size: Literal["848x480", "424x240"] = "424x240"
+    camera_hz: float = Field(default=5.0, gt=0, le=90, description="of depth images, and of grey ones with tags")
+    depth_subpixel_px: float = Field(default=0.08, ge=0, le=2, description="white noise of the disparity")
+    depth_correlated_px: float = Field(default=0.05, ge=0, le=2, description="noise of the disparity in patches")
+    depth_bias_px: float = Field(
+        default=0.15, ge=0, le=2, description="smooth error of the disparity, the same all flight long, RMS"
+    )
+    depth_range_m: float = Field(default=8.0, gt=0, description="half of the pixels are lost at this depth")
+    depth_holes: float = Field(default=0.01, ge=0, lt=1, description="share of pixels lost by chance")

@@ -1,4 +1,4 @@
-"""A simulated flight as a stream: sweeps, inertial samples and the truth."""
+"""A simulated flight as a stream: sweeps, inertial samples, depth images and the truth."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mineloc.config import SimulateConfig
-from mineloc.data import Calibration, FlightInfo, ImuSamples, Sweep, Trajectory
+from mineloc.data import Calibration, DepthImage, FlightInfo, ImuSamples, Sweep, Trajectory
 from mineloc.errors import SimulationError
 from mineloc.roadways.graph import RoadwayGraph
+from mineloc.sim.camera_mount import camera_model, camera_mounting
+from mineloc.sim.depth_camera import DepthCamera, DepthErrors, DepthView
 from mineloc.sim.drone import drone_motion
 from mineloc.sim.imu import Imu, ImuNoise, mounting
 from mineloc.sim.lidar import LidarModel, lidar_model
@@ -35,6 +37,9 @@ AFTER_NS = 20_000_000
 
 # what a random stream is for
 _TOUR, _SWAY, _VIBRATION, _IMU, _RANGES, _LOSS = range(1, 7)
+_DEPTH, _DEPTH_BIAS = 24, 25
+# the camera runs on its own: its images are not taken when a sweep begins
+_SHUTTER_NS = 13_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,11 +50,13 @@ class Packet:
         sweep: one revolution, points in the lidar frame at each point's own time; None if it was lost.
         imu: the samples during that revolution.
         truth: `T_map_body` at 100 Hz during that revolution.
+        depth: the depth images taken during that revolution.
     """
 
     sweep: Sweep | None
     imu: ImuSamples
     truth: Trajectory
+    depth: tuple[DepthImage, ...] = ()
 
 
 class SimulatedFlight:
@@ -74,6 +81,7 @@ class SimulatedFlight:
         self.calibration = Calibration(
             T_body_lidar=mounting(0.4, 1.5, -0.3, (0.05, 0.0, 0.12)),
             T_body_imu=mounting(-0.5, 0.3, 0.8, (-0.04, 0.03, 0.02)),
+            T_body_camera=camera_mounting() if config.camera or config.tags else None,
         )
         scene, clearance = mine.scene, config.clearance_m
         self.graph = passable(mine.graph, scene, clearance_m=clearance)
@@ -95,6 +103,7 @@ class SimulatedFlight:
             rng=_rng(config.seed, _SWAY),
         )
         self.machine = Machine(self.motion, scene) if config.machine else None
+        self._camera = _depth_camera(scene, config) if config.camera else None
         self.sweeps = int(self.motion.end_s * config.lidar_hz) - 1
         self.lost = missing(self.sweeps, config.sweep_loss, _rng(config.seed, _LOSS))
         self.info = FlightInfo(
@@ -133,6 +142,7 @@ class SimulatedFlight:
                 None if self.lost[revolution] else self.sweep(revolution),
                 imu.until(START_NS + end_ns),
                 Trajectory(stamps, self.pose(stamps)),
+                self._depth_images(START_NS + begin_ns, START_NS + end_ns),
             )
 
     def sweep(self, revolution: int) -> Sweep:
@@ -151,6 +161,60 @@ class SimulatedFlight:
         errors = RangeErrors(lidar.sigma_m, config.grazing_noise, config.loss, config.dust, config.dust_depth_m)
         returns = measure(lidar, shots, hits, errors, _rng(config.seed, _RANGES, revolution))
         return _as_sweep(shots, returns, START_NS + round(firings.time_s[0] * 1e9), round(1e9 / config.lidar_hz))
+
+    def true_depth(self, stamp_ns: int) -> DepthImage:
+        """What an error-free depth camera would see at any time of the flight; 0 where nothing is.
+
+        Raises:
+            ValueError: the configuration has no camera.
+        """
+        camera, view = self._view(stamp_ns)
+        return DepthImage(
+            stamp_ns, np.where(np.isfinite(view.depth_m), view.depth_m, 0.0).astype(np.float32), camera.camera
+        )
+
+    def depth_image(self, index: int) -> DepthImage:
+        """One measured depth image, counted from 0.
+
+        Raises:
+            ValueError: the configuration has no camera.
+        """
+        stamp_ns = self._exposure_ns(index)
+        camera, view = self._view(stamp_ns)
+        return DepthImage(stamp_ns, camera.measure(view, _rng(self.config.seed, _DEPTH, index)), camera.camera)
+
+    def _exposure_ns(self, index: int) -> int:
+        return START_NS + _SHUTTER_NS + round(index * 1e9 / self.config.camera_hz)
+
+    def _view(self, stamp_ns: int) -> tuple[DepthCamera, DepthView]:
+        if self._camera is None or self.calibration.T_body_camera is None:
+            raise ValueError("this flight has no depth camera: simulate.camera")
+        T_map_camera = self.pose(np.array([stamp_ns]))[0] @ self.calibration.T_body_camera
+        box = self.machine.pose((stamp_ns - START_NS) * 1e-9) if self.machine else None
+        return self._camera, self._camera.look(T_map_camera, box)
+
+    def _depth_images(self, begin_ns: int, end_ns: int) -> tuple[DepthImage, ...]:
+        """Those taken in `[begin_ns, end_ns)`."""
+        if self._camera is None:
+            return ()
+        first = max(0, int((begin_ns - START_NS - _SHUTTER_NS) * 1e-9 * self.config.camera_hz) - 1)
+        out: list[DepthImage] = []
+        while (stamp_ns := self._exposure_ns(first)) < end_ns:
+            if stamp_ns >= begin_ns:
+                out.append(self.depth_image(first))
+            first += 1
+        return tuple(out)
+
+
+def _depth_camera(scene: Scene, config: SimulateConfig) -> DepthCamera:
+    errors = DepthErrors(
+        config.depth_subpixel_px,
+        config.depth_correlated_px,
+        config.depth_bias_px,
+        config.depth_range_m,
+        config.depth_holes,
+    )
+    return DepthCamera(scene, camera_model(config.camera_size), errors, _rng(config.seed, _DEPTH_BIAS))
 
 
 def _as_sweep(shots: Shots, returns: Returns, start_ns: int, period_ns: int) -> Sweep:

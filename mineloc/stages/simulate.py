@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,10 @@ from mineloc.config import Config
 from mineloc.io import control_points as survey_files
 from mineloc.io.flight import FlightWriter
 from mineloc.progress import Progress, quiet
-from mineloc.sim.flight import SimulatedFlight
+from mineloc.sim.camera_mount import camera_model
+from mineloc.sim.flight import TRUTH_NS, Packet, SimulatedFlight
 from mineloc.sim.mine import load_mine
+from mineloc.sim.tag_camera import TagCamera
 from mineloc.sim.targets import GRID_FILE, TargetSurvey, survey_of
 
 
@@ -23,7 +26,7 @@ class SimulateResult:
 
     Attributes:
         out: the flight file.
-        sweeps, points: written; lost sweeps are not counted.
+        sweeps, points, depth_images, grey_images: written; lost sweeps are not counted.
         path_m: length of the true path.
         duration_s: of the flight.
         roadways_m: length of all roadways of the mine.
@@ -41,6 +44,8 @@ class SimulateResult:
     intersections: int
     roadways_seen: int
     roadways: int
+    depth_images: int = 0
+    grey_images: int = 0
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -79,11 +84,13 @@ def simulate(
         roadway_height_m=settings.roadway_height_m,
     )
     flight = SimulatedFlight(site, settings, start=start)
-    sweeps, points, path_m = _write(flight, out, progress)
+    counts, path_m = _write(flight, out, progress)
     return SimulateResult(
         out=out,
-        sweeps=sweeps,
-        points=points,
+        sweeps=counts["sweeps"],
+        points=counts["points"],
+        depth_images=counts["depth"],
+        grey_images=counts["grey"],
         path_m=path_m,
         duration_s=flight.sweeps / settings.lidar_hz,
         roadways_m=site.graph.length_m,
@@ -93,26 +100,47 @@ def simulate(
     )
 
 
-def _write(flight: SimulatedFlight, out: Path, progress: Progress) -> tuple[int, int, float]:
-    """Sweeps and points written, and the length of the true path."""
-    sweeps = points = 0
+def _write(flight: SimulatedFlight, out: Path, progress: Progress) -> tuple[Counter[str], float]:
+    """What was written, counted, and the length of the true path."""
+    counts: Counter[str] = Counter()
     path_m, last_m = 0.0, flight.motion.pose(np.zeros(1))[0, :3, 3]
     survey = survey_of(flight)
     with FlightWriter(out, flight.info, flight.calibration) as writer:
         if survey is not None:
             _attach(survey, writer)
+        tags = _tag_camera(flight, survey)
         for done, packet in enumerate(flight.packets(), start=1):
+            # images before the sweep: it ends later than they were taken
+            for image in packet.depth:
+                writer.add_depth(image)
+                counts["depth"] += 1
+            for picture in () if tags is None else tags.between(*_span(packet)):
+                writer.add_grey(picture)
+                counts["grey"] += 1
             if packet.sweep is not None:
                 writer.add_sweep(packet.sweep)
-                sweeps += 1
-                points += len(packet.sweep)
+                counts["sweeps"] += 1
+                counts["points"] += len(packet.sweep)
             writer.add_imu(packet.imu)
             writer.add_reference(packet.truth)
             line_m = np.vstack([last_m, packet.truth.positions_m])
             path_m += float(np.linalg.norm(np.diff(line_m, axis=0), axis=1).sum())
             last_m = line_m[-1]
             progress(done, flight.sweeps, "sweeps")
-    return sweeps, points, path_m
+    return counts, path_m
+
+
+def _tag_camera(flight: SimulatedFlight, survey: TargetSurvey | None) -> TagCamera | None:
+    """Who takes the grey images; None when there are no tags."""
+    config, T_body_camera = flight.config, flight.calibration.T_body_camera
+    if not config.tags or survey is None or T_body_camera is None:
+        return None
+    return TagCamera(flight, survey, camera_model("848x480"), T_body_camera, rate_hz=config.camera_hz)
+
+
+def _span(packet: Packet) -> tuple[int, int]:
+    """The time of a packet, from its first true pose to before the next packet's."""
+    return int(packet.truth.stamps_ns[0]), int(packet.truth.stamps_ns[-1]) + TRUTH_NS
 
 
 def _attach(survey: TargetSurvey, writer: FlightWriter) -> None:

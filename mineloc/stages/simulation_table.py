@@ -18,4 +18,7 @@ def simulation_table(result: SimulateResult) -> Table:
     table.add_row("path", f"{result.path_m:,.1f} m in {result.duration_s:,.0f} s")
     table.add_row("roadways flown", f"{result.roadways_seen} of {result.roadways}")
     table.add_row("sweeps", f"{result.sweeps:,} with {result.points / max(result.sweeps, 1):,.0f} points each")
+    for kind, count in (("depth images", result.depth_images), ("grey images", result.grey_images)):
+        if count:
+            table.add_row(kind, f"{count:,}")
     return table
