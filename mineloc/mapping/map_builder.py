@@ -13,7 +13,7 @@ from mineloc.data import F32, F64, MapCloud
 from mineloc.mapping.map_outliers import believed
 from mineloc.mapping.seen_through import ViewRecorder
 from mineloc.mapping.surface_thinning import thin_surface
-from mineloc.mapping.voxel_moments import COLUMNS, Voxels, VoxelTable, gather_points, no_voxels, unpack
+from mineloc.mapping.voxel_moments import COLUMNS, Voxels, VoxelTable, gather_points, no_voxels
 
 SHARDS = 4
 """Fixed, so that a map does not depend on the number of threads."""
@@ -89,9 +89,9 @@ class MapBuilder:
         """
         voxels, edge_m = self._voxels(), self.config.voxel_m
         sensors = np.array(self._sensors).reshape(-1, 3)
-        centres: F64 = ((unpack(voxels.keys) + 0.5) * edge_m).astype(np.float64)
-        surface = thin_surface(voxels, centres, sensors, edge_m)
+        surface = thin_surface(voxels, sensors, edge_m)
         keys = voxels.keys[surface.rows]
+        del voxels
         surface = surface.take(believed(surface, keys, self._views.views(), self.config))
         kinds = np.zeros(len(surface.rows), np.uint8)
         return MapCloud(self.origin_m, *surface[1:], kinds, edge_m, frame)

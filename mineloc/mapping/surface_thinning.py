@@ -13,7 +13,18 @@ import numpy as np
 
 from mineloc.compiled import njit, prange
 from mineloc.data import F32, F64, I32, I64, Bool
-from mineloc.mapping.voxel_moments import COUNT, FIRST, NEAR_M2, NEAREST, SECOND, VISITS, WEIGHT, Voxels
+from mineloc.mapping.voxel_moments import (
+    COUNT,
+    FIRST,
+    NEAR_M2,
+    NEAREST,
+    REACH,
+    SECOND,
+    VISITS,
+    WEIGHT,
+    Voxels,
+    unpack,
+)
 
 CHUNKS = 64
 """Fixed, so that a result does not depend on the number of threads."""
@@ -61,26 +72,23 @@ class ThinSurface(NamedTuple):
         )
 
 
-def thin_surface(voxels: Voxels, centres_m: F64, sensors_m: F64, voxel_m: float) -> ThinSurface:
+def thin_surface(voxels: Voxels, sensors_m: F64, voxel_m: float) -> ThinSurface:
     """Join the voxels across the surface.
 
     Args:
         voxels: sorted by key.
-        centres_m: (n, 3) of the voxels.
-        sensors_m: (k, 3) places of the visits, in the same frame.
+        sensors_m: (k, 3) places of the visits, relative to the map's origin.
         voxel_m: edge.
     """
     normals = fit_normals(voxels.keys, voxels.moments, voxel_m)
-    towards = sensors_m[voxels.tallies[:, NEAREST]] - centres_m
-    away = np.einsum("ij,ij->i", normals, towards) < 0
-    normals[away] *= -1.0
+    face_sensors(normals, voxels.keys, voxels.tallies, sensors_m, voxel_m)
     kept = np.zeros(len(normals), np.bool_)
     joined = join_across(voxels, normals, voxel_m, kept)
     rows = np.flatnonzero(kept)
     joined = joined[rows]
     return ThinSurface(
         rows,
-        (centres_m[rows] + joined[:, :3]).astype(np.float32),
+        ((unpack(voxels.keys[rows]) + 0.5) * voxel_m + joined[:, :3]).astype(np.float32),
         normals[rows],
         np.rint(joined[:, 4]).astype(np.int32),
         voxels.tallies[rows, VISITS],
@@ -121,6 +129,20 @@ def fit_normals(keys: I64, moments: F32, voxel_m: float) -> F32:
                     j += 1
             _normal(sums, out[i])
     return out
+
+
+@njit(cache=True, parallel=True)
+def face_sensors(normals: F32, keys: I64, tallies: I32, sensors: F64, voxel_m: float) -> None:
+    """Turn (n, 3) normals to the side from which each voxel was seen from nearest."""
+    part = (1 << 21) - 1
+    for i in prange(len(keys)):
+        sensor, key = sensors[tallies[i, NEAREST]], keys[i]
+        x = sensor[0] - ((key >> 42) - REACH + 0.5) * voxel_m
+        y = sensor[1] - (((key >> 21) & part) - REACH + 0.5) * voxel_m
+        z = sensor[2] - ((key & part) - REACH + 0.5) * voxel_m
+        if normals[i, 0] * x + normals[i, 1] * y + normals[i, 2] * z < 0:
+            for k in range(3):
+                normals[i, k] = -normals[i, k]
 
 
 @njit(cache=True)
