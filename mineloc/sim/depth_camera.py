@@ -86,10 +86,10 @@ class DepthCamera:
 
     def look(self, T_map_camera: F64, T_map_box: F64 | None = None) -> DepthView:
         """The truth from (4, 4); a machine's box may stand in the way."""
-        directions = self._directions @ T_map_camera[:3, :3].T
-        rays = np.empty((len(directions), 6), np.float32)
+        rays = np.empty((len(self._directions), 6), np.float32)
         rays[:, :3] = T_map_camera[:3, 3] - self._scene.origin_m
-        rays[:, 3:] = directions
+        # not a matrix product: its threads wait for each other longer than this takes
+        rays[:, 3:] = np.einsum("ni,ji->nj", self._directions, T_map_camera[:3, :3])
         hits: Hits = self._scene.cast(rays)
         if T_map_box is not None:
             T_scene_box = T_map_box.copy()
