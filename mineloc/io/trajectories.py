@@ -45,6 +45,8 @@ class LoadedTrajectory:
         kind: the format that it turned out to be.
         duplicates: poses that were there twice, same time and same pose; kept once.
         conflicts: other poses for a time that already had one; the first is kept.
+        positions_only: a laser tracker's file with all quaternions 0; the orientations stand as identity and mean
+            nothing.
     """
 
     trajectory: Trajectory
@@ -52,6 +54,7 @@ class LoadedTrajectory:
     kind: Kind
     duplicates: int = 0
     conflicts: int = 0
+    positions_only: bool = False
 
 
 def read_trajectory(spec: str | Path) -> Trajectory:
@@ -89,7 +92,8 @@ def load_trajectory(spec: str | Path) -> LoadedTrajectory:
     number, first = rows[0]
     if len(first) == 8:
         distinct = _parse_tum(path, rows)
-        return LoadedTrajectory(_trajectory(distinct), str(path), "tum", distinct.duplicates, distinct.conflicts)
+        facts = distinct.duplicates, distinct.conflicts, _without_turns(distinct.values)
+        return LoadedTrajectory(_trajectory(distinct), str(path), "tum", *facts)
     if len(first) == 12:
         return LoadedTrajectory(_parse_kitti(path, rows), str(path), "kitti")
     raise FormatError(
@@ -102,6 +106,8 @@ def load_trajectory(spec: str | Path) -> LoadedTrajectory:
 
 def read_tum(path: Path) -> Trajectory:
     """A TUM file. Comments (`#`) and blank lines are skipped, quaternions normalised, repeated lines kept once.
+
+    Quaternions that are 0 in all lines are a laser tracker's, which knows positions only: identity.
 
     Raises:
         FormatError: no such file, no poses, or a line that is not a pose, with its number.
@@ -191,7 +197,14 @@ def _pose_rows(path: Path) -> list[tuple[int, list[str]]]:
 
 def _trajectory(distinct: DistinctPoses) -> Trajectory:
     values = distinct.values
+    if _without_turns(values):
+        values = np.column_stack([values[:, :6], np.ones(len(values))])
     return Trajectory(distinct.stamps_ns, se3.from_xyzw(values[:, :3], values[:, 3:]))
+
+
+def _without_turns(values: F64) -> bool:
+    """Whether no line of (n, 7) has a quaternion."""
+    return not values[:, 3:].any()
 
 
 def _numbers(path: Path, rows: list[tuple[int, list[str]]], *, skip: int, count: int, expected: str) -> F64:
@@ -223,7 +236,7 @@ def _parse_tum(path: Path, rows: list[tuple[int, list[str]]]) -> DistinctPoses:
     values = _numbers(path, rows, skip=1, count=7, expected=_TUM)
     stamps = np.array([_stamp_ns(path, number, fields[0]) for number, fields in rows], dtype=np.int64)
     norm = np.linalg.norm(values[:, 3:], axis=1)
-    bad = np.flatnonzero(np.abs(norm - 1.0) > 0.1)
+    bad = np.flatnonzero(np.abs(norm - 1.0) > 0.1) if norm.any() else np.zeros(0, np.int64)
     if bad.size:
         raise FormatError(
             _line(path, rows[bad[0]][0]),

@@ -70,12 +70,14 @@ def evaluate(
         FormatError: a file cannot be read; NaN is told with its line.
     """
     config = config if config is not None else EvaluateConfig()
-    trajectories, own_reference, trusted_share, notes = _estimates(estimate)
-    truth = _reference(estimate, reference, own_reference)
+    given = _estimates(estimate)
+    truth = _reference(estimate, reference, given.reference)
+    positions_only = truth.positions_only or given.positions_only
+    kinds = _alignments(estimate, align, positions_only=positions_only)
     scores: list[Scores] = []
-    for name, trajectory in trajectories.items():
+    for name, trajectory in given.trajectories.items():
         pairs = _pairs(str(estimate), trajectory, truth, config)
-        one = score(name, truth.trajectory, trajectory, pairs, (align,) if align else ALIGNMENTS, config)
+        one = score(name, truth.trajectory, trajectory, pairs, kinds, config, positions_only=positions_only)
         if not one.aligned:
             raise EvaluationError(estimate, one.notes[0], todo="choose --align origin or none")
         scores.append(one)
@@ -83,25 +85,47 @@ def evaluate(
         estimate=str(estimate),
         reference=truth.source,
         scores=tuple(scores),
-        trusted_share=trusted_share,
-        notes=(*notes, *_left_out(truth)),
+        trusted_share=given.trusted_share,
+        notes=(*given.notes, *_remarks(truth)),
     )
 
 
-def _estimates(
-    estimate: str | Path,
-) -> tuple[dict[str, Trajectory], LoadedTrajectory | None, float | None, tuple[str, ...]]:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Estimates:
+    """What is to be scored, by name, and what came along with it."""
+
+    trajectories: dict[str, Trajectory]
+    reference: LoadedTrajectory | None = None
+    trusted_share: float | None = None
+    notes: tuple[str, ...] = ()
+    positions_only: bool = False
+
+
+def _estimates(estimate: str | Path) -> _Estimates:
     folder = Path(estimate)
     if not folder.is_dir():
         loaded = load_trajectory(estimate)
-        return {"estimate": loaded.trajectory}, None, None, _left_out(loaded)
+        return _Estimates({"estimate": loaded.trajectory}, notes=_remarks(loaded), positions_only=loaded.positions_only)
     run = RunFolder.open(folder)
     own = None
     if run.reference is not None:
         own = LoadedTrajectory(run.reference, str(folder / "reference.tum"), "tum")
     trusted = run.sweeps["trusted"].to_numpy()
     share = float(trusted.mean()) if len(trusted) else None
-    return {"smoothed": run.smoothed, "online": run.online}, own, share, ()
+    return _Estimates({"smoothed": run.smoothed, "online": run.online}, own, share)
+
+
+def _alignments(estimate: str | Path, align: Alignment | None, *, positions_only: bool) -> tuple[Alignment, ...]:
+    if not positions_only:
+        return (align,) if align else ALIGNMENTS
+    if align == "origin":
+        raise EvaluationError(
+            estimate,
+            "--align origin needs orientations on both sides",
+            expected="one of none, posyaw, se3",
+            todo="choose --align se3",
+        )
+    return (align,) if align else tuple(kind for kind in ALIGNMENTS if kind != "origin")
 
 
 def _reference(
@@ -116,13 +140,16 @@ def _reference(
     return own_reference
 
 
-def _left_out(loaded: LoadedTrajectory) -> tuple[str, ...]:
-    if not loaded.duplicates and not loaded.conflicts:
-        return ()
-    return (
-        f"{loaded.source}: left out {loaded.duplicates} repeated poses and "
-        f"{loaded.conflicts} others for a time that had one",
-    )
+def _remarks(loaded: LoadedTrajectory) -> tuple[str, ...]:
+    out: list[str] = []
+    if loaded.duplicates or loaded.conflicts:
+        out.append(
+            f"{loaded.source}: left out {loaded.duplicates} repeated poses and "
+            f"{loaded.conflicts} others for a time that had one"
+        )
+    if loaded.positions_only:
+        out.append(f"{loaded.source}: positions only; what needs orientations is left out")
+    return tuple(out)
 
 
 def _pairs(where: str, trajectory: Trajectory, truth: LoadedTrajectory, config: EvaluateConfig) -> Pairs:

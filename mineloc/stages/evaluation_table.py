@@ -66,8 +66,9 @@ def _facts(evaluation: Evaluation, prefix: str) -> Iterator[str]:
 
 
 def tables(evaluation: Evaluation) -> list[Table]:
-    """The absolute errors by alignment, and the errors over pieces of the flight."""
-    return [_absolute(evaluation), _pieces(evaluation)]
+    """The absolute errors by alignment, and the errors over pieces of the flight, which need orientations."""
+    pieces = [] if all(scores.positions_only for scores in evaluation.scores) else [_pieces(evaluation)]
+    return [_absolute(evaluation), *pieces]
 
 
 def _pairing(scores: Scores) -> str:
@@ -102,7 +103,7 @@ def _absolute(evaluation: Evaluation) -> Table:
         for one in scores.aligned:
             t, r = one.absolute.translation_m, one.absolute.rotation_deg
             metres = (_number(x, 3) for x in (t.rmse, t.mean, t.median, t.std, t.min, t.max))
-            angles = (f"{r.rmse:.2f}", f"{r.max:.2f}")
+            angles = (_NOTHING, _NOTHING) if scores.positions_only else (f"{r.rmse:.2f}", f"{r.max:.2f}")
             table.add_row(scores.name, one.absolute.alignment, *metres, *angles)
     return table
 

@@ -23,11 +23,11 @@ class AlignedScores:
     absolute: AbsoluteError
     relative: tuple[RelativeError, ...]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self, *, positions_only: bool = False) -> dict[str, Any]:
         """Plain values by name."""
         return {
             "alignment": self.absolute.alignment,
-            "ape": self.absolute.to_dict(),
+            "ape": self.absolute.to_dict() | ({"rotation_deg": None} if positions_only else {}),
             "rpe": [one.to_dict() for one in self.relative],
         }
 
@@ -44,6 +44,7 @@ class Scores:
         percent: REP-1, REP-2 …
         segments: KITTI.
         notes: what could not be scored, and why.
+        positions_only: no orientations were compared; measures that need them are empty, rotation errors mean nothing.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Scores:
     percent: tuple[PercentError, ...]
     segments: SegmentError
     notes: tuple[str, ...]
+    positions_only: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values by name, without the arrays along the flight."""
@@ -60,7 +62,7 @@ class Scores:
             "name": self.name,
             "association": self.pairs.to_dict(),
             "coverage": self.coverage.to_dict(),
-            "aligned": [one.to_dict() for one in self.aligned],
+            "aligned": [one.to_dict(positions_only=self.positions_only) for one in self.aligned],
             "rep": [one.to_dict() for one in self.percent],
             "segments": self.segments.to_dict(),
             "notes": list(self.notes),
@@ -85,8 +87,12 @@ def score(
     pairs: Pairs,
     alignments: Sequence[Alignment],
     config: EvaluateConfig,
+    *,
+    positions_only: bool = False,
 ) -> Scores:
     """Score the pairs of one estimate. An alignment that the poses leave open becomes a note.
+
+    With `positions_only` RPE, REP and KITTI are left out: they compare motions in the frame of the pose before.
 
     Raises:
         ValueError: no pairs.
@@ -101,15 +107,17 @@ def score(
         except ValueError as error:
             notes.append(f"no {kind} alignment: {error}")
             continue
-        aligned.append(AlignedScores(absolute, _relative(pairs, absolute, config)))
+        aligned.append(AlignedScores(absolute, () if positions_only else _relative(pairs, absolute, config)))
+    percents, lengths_m = ((), ()) if positions_only else (config.rep_percents, config.segment_lengths_m)
     return Scores(
         name=name,
         pairs=pairs,
         coverage=coverage(reference, estimate, max_gap_s=config.max_gap_s),
         aligned=tuple(aligned),
-        percent=percent_errors(pairs, path_length_m=float(reference.path_m[-1]), percents=config.rep_percents),
-        segments=segment_errors(pairs, lengths_m=config.segment_lengths_m, step=config.segment_step),
+        percent=percent_errors(pairs, path_length_m=float(reference.path_m[-1]), percents=percents),
+        segments=segment_errors(pairs, lengths_m=lengths_m, step=config.segment_step),
         notes=tuple(notes),
+        positions_only=positions_only,
     )
 
 

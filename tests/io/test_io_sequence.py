@@ -23,6 +23,8 @@ def test_m2dgr_says_what_its_recording_does_not():
     sequence = load_sequence(DATASETS / "m2dgr_hall_02.toml")
     assert (sequence.lidar.header, sequence.lidar.time_unit, sequence.lidar.rings) == ("end", "s", "field")
     np.testing.assert_allclose(sequence.calibration.T_lidar_imu[:3, 3], [-0.27255, 0.00053, -0.17954])
+    # `body` is what the reference places: the prism
+    np.testing.assert_allclose(sequence.calibration.T_body_lidar[:3, 3], [0.21374, -0.00146, -0.68356])
     assert sequence.flight_info(source="hall_02.bag").lidar == "Velodyne VLP-32C"
 
 

@@ -86,7 +86,7 @@ def test_comments_blank_lines_and_scaled_quaternions(tmp_path):
         (["1 0 0 0 0 0 0 1", "2 0 0 nan 0 0 0 1"], "line 2: NaN or infinity"),
         (["1 0 0 0 0 0 0 1", "", "2 0 0 0 0 0 1"], "line 3: 7 values"),
         (["1 0 0 0 0 0 0 1", "2 0 0 zero 0 0 0 1"], "line 2: not numbers"),
-        (["1 0 0 0 0 0 0 0"], "line 1: a quaternion of length 0"),
+        (["1 0 0 0 0 0 0 1", "2 0 0 0 0 0 0 0"], "line 2: a quaternion of length 0"),
         (["1 0 0 0 10 0 0 1"], "a quaternion of length 10"),
         (["2 0 0 0 0 0 0 1", "1 0 0 0 0 0 0 1"], "line 2: time goes backwards (1 after 2)"),
         (["1790000000123456789 0 0 0 0 0 0 1"], "convert nanoseconds to seconds"),
