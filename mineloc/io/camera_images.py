@@ -143,10 +143,19 @@ def encode_camera_info(camera: CameraModel, stamp_ns: int) -> U8:
 
 
 def decode_camera_info(data: bytes | memoryview) -> CameraModel:
-    """The geometry in a CameraInfo; its distortion is not looked at."""
-    message = cast("Any", STORE.deserialize_cdr(data, CAMERA_INFO))
-    k = message.k
-    return CameraModel(int(message.width), int(message.height), float(k[0]), float(k[4]), float(k[2]), float(k[5]))
+    """The geometry in a serialised CameraInfo; its distortion is not looked at."""
+    return camera_of(STORE.deserialize_cdr(data, CAMERA_INFO))
+
+
+def camera_of(message: object) -> CameraModel:
+    """The geometry in a decoded CameraInfo; its distortion is not looked at.
+
+    Raises:
+        ValueError: it is that of no camera.
+    """
+    info = cast("Any", message)
+    k = info.k if hasattr(info, "k") else info.K  # ROS 1 has capitals
+    return CameraModel(int(info.width), int(info.height), float(k[0]), float(k[4]), float(k[2]), float(k[5]))
 
 
 def camera_json(camera: CameraModel) -> str:

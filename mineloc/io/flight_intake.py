@@ -14,6 +14,7 @@ from mineloc.config import IngestConfig
 from mineloc.data import Calibration, FlightInfo
 from mineloc.errors import IngestError
 from mineloc.io import flight_layout as layout
+from mineloc.io.depth_intake import DepthIntake, DepthTopic, find_depth, why_left_out
 from mineloc.io.findings import Finding
 from mineloc.io.flight_writer import FlightWriter
 from mineloc.io.health import Health, HealthFinding, Severity, sorted_findings
@@ -51,6 +52,7 @@ class Plan:
         info, calibration: facts for the flight.
         remarks: where they come from, one finding each.
         earlier: the health record of a recording that is a flight already.
+        depth: the topic of depth images that can be used.
     """
 
     roles: Roles
@@ -58,6 +60,7 @@ class Plan:
     calibration: Calibration
     remarks: tuple[HealthFinding, ...]
     earlier: Mapping[str, Any] | None
+    depth: DepthTopic | None = None
 
 
 def plan_flight(recording: Recording, told: Sequence) -> Plan:
@@ -71,7 +74,8 @@ def plan_flight(recording: Recording, told: Sequence) -> Plan:
         IngestError: ambiguous, missing or undecodable topics.
     """
     roles = choose_roles(recording.path, recording.topics, told.topics)
-    remarks = [HealthFinding("topic_assumed", "info", 1, line) for line in roles.assumed]
+    depth, assumed = find_depth(recording, told.topics.depth)
+    remarks = [*(HealthFinding("topic_assumed", "info", 1, line) for line in roles.assumed), *assumed]
     facts = _own_facts(recording)
     info = told.flight_info(source=recording.path.name)
     calibration, earlier = told.calibration, None
@@ -81,11 +85,17 @@ def plan_flight(recording: Recording, told: Sequence) -> Plan:
         info = _override(own, info)
     if "T_body" in told.model_fields_set:
         calibration = told.calibration
-    elif facts is None and (found := _static_calibration(recording, roles)) is not None:
+    elif facts is None and (found := _static_calibration(recording, roles, depth)) is not None:
         calibration, body = found
         line = f"sensors are placed by /tf_static: {body} counts as the body"
         remarks.append(HealthFinding("calibration_from_tf", "info", 1, line))
-    return Plan(roles, info, calibration, tuple(remarks), earlier)
+    if (
+        depth is not None
+        and (left_out := why_left_out(depth, placed=calibration.T_body_camera is not None)) is not None
+    ):
+        remarks.append(left_out)
+        depth = None
+    return Plan(roles, info, calibration, tuple(remarks), earlier, depth)
 
 
 def _own_facts(recording: Recording) -> tuple[FlightInfo, Calibration, Mapping[str, Any]] | None:
@@ -108,7 +118,7 @@ def _override(own: FlightInfo, told: FlightInfo) -> FlightInfo:
     return FlightInfo(**{**values, "source": own.source or told.source})
 
 
-def _static_calibration(recording: Recording, roles: Roles) -> tuple[Calibration, str] | None:
+def _static_calibration(recording: Recording, roles: Roles, depth: DepthTopic | None) -> tuple[Calibration, str] | None:
     names = [t.name for t in recording.topics.values() if t.msgtype == TF_MESSAGE and t.name.endswith("tf_static")]
     if not names:
         return None
@@ -122,7 +132,8 @@ def _static_calibration(recording: Recording, roles: Roles) -> tuple[Calibration
                 break
             with suppress(IngestError):  # one that does not decode places nothing
                 frames.add(raw.message)
-    return frames.calibration(_frame_of(recording, roles.lidar), _frame_of(recording, roles.imu))
+    camera = "" if depth is None else depth.frame
+    return frames.calibration(_frame_of(recording, roles.lidar), _frame_of(recording, roles.imu), camera)
 
 
 def _frame_of(recording: Recording, topic: Topic | None) -> str:
@@ -178,6 +189,9 @@ class FlightIntake:
             monitor = TopicMonitor("odometry", roles.odometry)
             poses = self._pose_decoder(roles.odometry, ReferenceRules(), np.eye(4), layout.ODOM_FRAME)
             self._takers[roles.odometry.name] = PoseIntake(monitor, poses, writer.add_odometry, None)
+        if plan.depth is not None and plan.depth.camera is not None:
+            topic = plan.depth.topic
+            self._takers[topic.name] = DepthIntake(TopicMonitor("depth", topic), plan.depth.camera, writer)
 
     def _where(self, topic: Topic) -> str:
         return f"{self._recording.path}: {topic.name}"
@@ -302,7 +316,7 @@ class FlightIntake:
         return next((error for error in errors if error is not None), None)
 
 
-_ROLE_ORDER = ("lidar", "imu", "reference", "odometry")
+_ROLE_ORDER = ("lidar", "imu", "reference", "odometry", "depth")
 
 
 def _graded(finding: Finding) -> HealthFinding:

@@ -36,7 +36,7 @@ class TopicHealth:
     """One topic that became part of the flight.
 
     Attributes:
-        role: "lidar", "imu", "reference" or "odometry".
+        role: "lidar", "imu", "reference", "odometry" or "depth".
         topic, msgtype: as recorded.
         messages: how many the file delivered.
         used: how many are in the flight.

@@ -25,6 +25,7 @@ class Topics(Section):
     imu: str = ""
     reference: str = Field(default="", description="Odometry, PoseStamped, PoseWithCovarianceStamped or TF")
     odometry: str = Field(default="", description="odometry kept beside the reference")
+    depth: str = Field(default="", description="Image, 16UC1 or 32FC1, with CameraInfo beside it")
 
 
 class LidarRules(Section):
@@ -88,6 +89,7 @@ class Mountings(Section):
 
     lidar: Mounting = Mounting()
     imu: Mounting = Mounting()
+    camera: Mounting | None = Field(default=None, description="of the optical frame: x right, y down, z ahead")
 
 
 class FlightFacts(Section):
@@ -112,13 +114,20 @@ class Sequence(Section):
     lidar: LidarRules = LidarRules()
     imu: ImuRules = ImuRules()
     reference: ReferenceRules = ReferenceRules()
-    T_body: Mountings = Field(default=Mountings(), description="[T_body.lidar], [T_body.imu]: sensors placed in body")
+    T_body: Mountings = Field(
+        default=Mountings(), description="[T_body.lidar], [T_body.imu], …: sensors placed in body"
+    )
     flight: FlightFacts = FlightFacts()
 
     @property
     def calibration(self) -> Calibration:
         """Where the sensors sit."""
-        return Calibration(self.T_body.lidar.transform(), self.T_body.imu.transform())
+        camera = self.T_body.camera
+        return Calibration(
+            self.T_body.lidar.transform(),
+            self.T_body.imu.transform(),
+            None if camera is None else camera.transform(),
+        )
 
     @property
     def T_places_body(self) -> F64:

@@ -48,24 +48,30 @@ class StaticFrames:
                     ahead.append(following)
         return None
 
-    def calibration(self, lidar_frame: str, imu_frame: str) -> tuple[Calibration, str] | None:
-        """Mountings of LiDAR and IMU, and which frame counts as the body; None if no frame is known.
+    def calibration(self, lidar_frame: str, imu_frame: str, camera_frame: str = "") -> tuple[Calibration, str] | None:
+        """Mountings of the sensors, and which frame counts as the body; None if no frame is known.
 
-        Without a frame that is a drone's, `body` is the LiDAR. A sensor that the tree does not reach sits at `body`.
+        Without a frame that is a drone's, `body` is the LiDAR. LiDAR and IMU that the tree does not reach sit at
+        `body`; a camera must be placed against the LiDAR to be placed at all.
 
         Args:
-            lidar_frame, imu_frame: `header.frame_id` of the sensors' messages, empty if there is no such sensor.
+            lidar_frame, imu_frame, camera_frame: `header.frame_id` of the sensors' messages, empty if there is no such
+                sensor.
         """
         for body in _BODIES:
             T_body_lidar = self.between(body, lidar_frame) if lidar_frame else None
             T_body_imu = self.between(body, imu_frame) if imu_frame else None
             if T_body_lidar is not None or T_body_imu is not None:
                 known = [np.eye(4) if T is None else T for T in (T_body_lidar, T_body_imu)]
-                return Calibration(*known), body
-        T_lidar_imu = self.between(lidar_frame, imu_frame) if lidar_frame and imu_frame else None
-        if T_lidar_imu is not None:
-            return Calibration(np.eye(4), T_lidar_imu), lidar_frame
-        return None
+                with_camera = camera_frame and (T_body_lidar is not None or not lidar_frame)
+                return Calibration(known[0], known[1], self.between(body, camera_frame) if with_camera else None), body
+        if not lidar_frame:
+            return None
+        T_lidar_imu = self.between(lidar_frame, imu_frame) if imu_frame else None
+        T_lidar_camera = self.between(lidar_frame, camera_frame) if camera_frame else None
+        if T_lidar_imu is None and T_lidar_camera is None:
+            return None
+        return Calibration(np.eye(4), np.eye(4) if T_lidar_imu is None else T_lidar_imu, T_lidar_camera), lidar_frame
 
 
 def frame_name(name: object) -> str:

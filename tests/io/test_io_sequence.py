@@ -44,7 +44,7 @@ def test_readme_names_every_key():
         ("[lidar]\nrate_hz = -1", r"lidar\.rate_hz = -1"),
         ("[T_body.imu]\ntranslation_m = [1, 2]", r"T_body\.imu\.translation_m"),
         ("[T_body.imu]\nquaternion_xyzw = [0, 0, 0, 2]", "quaternion of length 1"),
-        ("[T_body.camera]\n", r"unknown key T_body\.camera.*imu, lidar"),
+        ("[T_body.radar]\n", r"unknown key T_body\.radar.*camera, imu, lidar"),
         ("[T_body.imu]\ntranslation_m = [1, 2, nan]", r"T_body\.imu\.translation_m"),
         ("[lidar", "not TOML"),
     ],
