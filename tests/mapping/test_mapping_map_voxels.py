@@ -40,7 +40,7 @@ def _sorted(tables: list[VoxelTable]) -> Voxels:
     return Voxels(keys, moments, moments.view(np.int32)).take(np.argsort(keys))
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.integers(0, 10_000), st.sampled_from([1, 4]), st.floats(0.05, 0.5))
 def test_voxels_are_those_of_plain_numpy(seed: int, shards: int, voxel_m: float) -> None:
     rng = np.random.default_rng(seed)
