@@ -108,15 +108,21 @@ def decode_grey(data: bytes | memoryview, camera: CameraModel) -> GreyImage:
 
     Raises:
         ValueError: not such a message, or of another size.
-        OSError: the picture is none.
     """
     made = _grey_head()
     view = memoryview(data)
     head, picture = made.view(view[: made.dtype.itemsize]), view[made.dtype.itemsize :]
     if len(head) != 1 or int(head["size"][0]) != len(picture):
         raise ValueError("not a canonical picture")
-    with Image.open(io.BytesIO(picture), formats=["JPEG"]) as opened:
-        pixels = np.asarray(opened)
+    try:
+        with Image.open(io.BytesIO(picture), formats=["JPEG"]) as opened:
+            size = opened.size
+            pixels = np.asarray(opened) if size == (camera.width_px, camera.height_px) else np.zeros((0, 0), np.uint8)
+    except Exception as error:
+        # Pillow raises a dozen kinds of errors over bytes that are no picture
+        raise ValueError(f"a picture that cannot be decoded ({error})") from error
+    if not pixels.size:
+        raise ValueError(f"{size[0]} x {size[1]} pixels of a camera of {camera.width_px} x {camera.height_px}")
     return GreyImage(int(stamps_ns(head)[0]), pixels, camera)
 
 

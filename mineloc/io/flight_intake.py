@@ -17,6 +17,7 @@ from mineloc.io import flight_layout as layout
 from mineloc.io.depth_intake import DepthIntake, DepthTopic, find_depth, why_left_out
 from mineloc.io.findings import Finding
 from mineloc.io.flight_writer import FlightWriter
+from mineloc.io.grey_intake import GreyIntake
 from mineloc.io.health import Health, HealthFinding, Severity, sorted_findings
 from mineloc.io.imu_monitor import ImuMonitor
 from mineloc.io.intake import ImuIntake, Intake, LidarIntake, PoseIntake
@@ -192,6 +193,9 @@ class FlightIntake:
         if plan.depth is not None and plan.depth.camera is not None:
             topic = plan.depth.topic
             self._takers[topic.name] = DepthIntake(TopicMonitor("depth", topic), plan.depth.camera, writer)
+        grey = recording.topics.get(layout.GREY)
+        if grey is not None and plan.earlier is not None and plan.calibration.T_body_camera is not None:
+            self._takers[grey.name] = GreyIntake(TopicMonitor("grey", grey), writer)
 
     def _where(self, topic: Topic) -> str:
         return f"{self._recording.path}: {topic.name}"
@@ -316,7 +320,7 @@ class FlightIntake:
         return next((error for error in errors if error is not None), None)
 
 
-_ROLE_ORDER = ("lidar", "imu", "reference", "odometry", "depth")
+_ROLE_ORDER = ("lidar", "imu", "reference", "odometry", "depth", "grey")
 
 
 def _graded(finding: Finding) -> HealthFinding:

@@ -232,6 +232,10 @@ class FlightWriter:
         """
         self._add_image(image.stamp_ns, image.camera, layout.GREY, COMPRESSED_IMAGE, camera_images.encode_grey(image))
 
+    def add_raw_grey(self, data: U8, *, stamp_ns: int, camera: CameraModel) -> None:
+        """Append a grey image that is encoded already, exactly as `camera_images.encode_grey` does it."""
+        self._add_image(stamp_ns, camera, layout.GREY, COMPRESSED_IMAGE, data)
+
     def _add_image(self, stamp_ns: int, camera: CameraModel, topic: str, msgtype: str, data: U8) -> None:
         if self._calibration.T_body_camera is None:
             raise ValueError("images need a calibration with T_body_camera")

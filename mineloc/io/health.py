@@ -36,7 +36,7 @@ class TopicHealth:
     """One topic that became part of the flight.
 
     Attributes:
-        role: "lidar", "imu", "reference", "odometry" or "depth".
+        role: "lidar", "imu", "reference", "odometry", "depth" or "grey".
         topic, msgtype: as recorded.
         messages: how many the file delivered.
         used: how many are in the flight.

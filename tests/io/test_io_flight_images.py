@@ -221,8 +221,12 @@ def test_foreign_messages_are_refused():
     picture = camera_images.encode_grey(GREYS[0])
     with pytest.raises(ValueError, match="canonical"):
         camera_images.decode_grey(picture[:-1].data, CAMERA)
-    with pytest.raises(ValueError, match="height"):
+    with pytest.raises(ValueError, match="24 x 16 pixels of a camera of 16 x 24"):
         camera_images.decode_grey(picture.data, turned)
+    broken = picture.copy()
+    broken[60:] = 0
+    with pytest.raises(ValueError, match="cannot be decoded"):
+        camera_images.decode_grey(broken.data, CAMERA)
 
 
 def test_geometry_survives_both_ways():

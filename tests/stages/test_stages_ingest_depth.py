@@ -12,7 +12,7 @@ import recording_files as files
 from recording_files import CLOUD, ROS2, START_NS, STEP_NS, TF
 
 from mineloc import se3
-from mineloc.data import Calibration, CameraModel, DepthImage, FlightInfo
+from mineloc.data import Calibration, CameraModel, DepthImage, FlightInfo, GreyImage
 from mineloc.errors import IngestError
 from mineloc.io.depth_intake import depth_image
 from mineloc.io.flight import FlightReader, FlightWriter
@@ -190,10 +190,16 @@ def test_a_flight_with_images_ingests_to_an_equal_flight(tmp_path) -> None:
     with FlightWriter(tmp_path / "flown.mcap", FlightInfo(flight="7"), calibration) as writer:
         for i, image in enumerate(depths):
             writer.add_depth(image)
+            writer.add_grey(GreyImage(image.stamp_ns + 5, (_millimetres(i) % 251).astype(np.uint8), CAMERA))
             writer.add_sweep(drivers.vlp16_sweep(START_NS + i * STEP_NS, columns=40, seed=i))
     health = ingest(tmp_path / "flown.mcap", out=tmp_path / "again.mcap").health
     assert not _left_out(health)
-    with FlightReader(tmp_path / "again.mcap") as reader:
+    assert [topic.role for topic in health.topics] == ["lidar", "depth", "grey"]
+    with FlightReader(tmp_path / "flown.mcap") as flown, FlightReader(tmp_path / "again.mcap") as reader:
+        assert reader.grey_count == 6
+        for found, made in zip(reader.grey_images(), flown.grey_images(), strict=True):
+            # to the grey step: what was JPEG is not made JPEG again
+            np.testing.assert_array_equal(found.pixels, made.pixels)
         np.testing.assert_array_equal(reader.calibration.T_body_camera, calibration.T_body_camera)
         for found, made in zip(reader.depth_images(), depths, strict=True):
             assert (found.stamp_ns, found.camera) == (made.stamp_ns, made.camera)
