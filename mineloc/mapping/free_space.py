@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mineloc.compiled import njit
-from mineloc.data import F32, F64, I64, Bool, MapCloud
+from mineloc.data import F32, F64, I32, I64, Bool, MapCloud
 from mineloc.roadways.sheet import DX, DY, Sheet, components, fill_pinholes, link
 
 SKIN_M = 0.3
@@ -20,6 +20,7 @@ LEAST_FACING = 0.25
 """Mean vertical part of the normals that makes a floor or a roof."""
 STEP_M = 0.5
 """A floor goes on in the next column if it is no higher or lower than this."""
+STRAY_VISITS, STRAY_BESIDE = 2, 2
 GROWTHS = 8
 """A floor of which the roof was not seen, or the other way round, is believed so many columns on."""
 FILLINGS = 4
@@ -89,10 +90,38 @@ def columns_of(cloud: MapCloud, origin_m: F64, cell_m: float) -> Columns:
     height_mm = np.rint((cloud.points_m[:, 2] - cloud.points_m[:, 2].min(initial=0)) * 1e3).astype(np.int64)
     order = np.argsort((((cell[:, 1] - low[1]) * wide + cell[:, 0] - low[0]) << 24) + height_mm, kind="stable")
     number = (cell[:, 1] * WIDE + cell[:, 0])[order]
+    order = order[~stray(number, cloud.points_m[order, 2], cloud.visits[order])]
+    number = cell[order, 1] * WIDE + cell[order, 0]
     begin = np.flatnonzero(np.diff(number, prepend=-1))
     return Columns(
         number[begin], np.append(begin, len(number)), cloud.points_m[order, 2], cloud.normals[order, 2].copy()
     )
+
+
+@njit(cache=True)
+def stray(number: I64, height: F32, visits: I32) -> Bool:
+    """(n,) points that close no gap: seen once or twice, nearly alone in their column and not its ends.
+
+    A grain of dust or what is left of a machine hangs between floor and roof; a wall fills its column.
+
+    Args:
+        number: (n,) of the column, rising.
+        height: (n,) rising within a column.
+        visits: (n,).
+    """
+    n = len(number)
+    out = np.zeros(n, np.bool_)
+    for i in range(1, n - 1):
+        if visits[i] > STRAY_VISITS or number[i - 1] != number[i] or number[i + 1] != number[i]:
+            continue
+        beside = 0
+        for step in (-1, 1):
+            j = i + step
+            while 0 <= j < n and number[j] == number[i] and abs(height[j] - height[i]) <= SKIN_M:
+                beside += 1
+                j += step
+        out[i] = beside < STRAY_BESIDE
+    return out
 
 
 def _sheet(cell_m: float, origin_m: F64, column: I64, row: I64, floor_m: F64, roof_m: F64, opening_m: float) -> Sheet:

@@ -162,8 +162,21 @@ def _through(x: float, y: float, z: float, r: float, views: Views, v: int, margi
     c = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
     row, column = _cell(a, b, c)
     row -= views.row[v]
-    at = views.first[v] + row * COLUMNS + column
-    if row < 0 or at >= views.first[v + 1]:
+    beyond = (r + margin[0]) / margin[1] * _CM
+    if not _lies_beyond(views, v, row, column, beyond, True):
         return False
-    seen = views.ranges_cm[at] / _CM
-    return bool(seen > 0 and r + margin[0] < seen * margin[1])
+    # an edge of rock may fill the next direction and not this one
+    for up in range(-1, 2):
+        for side in range(-1, 2):
+            if up * side == 0 and not _lies_beyond(views, v, row + up, (column + side) % COLUMNS, beyond, False):
+                return False
+    return True
+
+
+@njit(cache=True)
+def _lies_beyond(views: Views, v: int, row: int, column: int, beyond_cm: float, unseen: bool) -> bool:
+    """Whether all that a view has in a cell is farther away; `unseen` tells what an empty cell is not."""
+    at = views.first[v] + row * COLUMNS + column
+    if row < 0 or at >= views.first[v + 1] or views.ranges_cm[at] == 0:
+        return not unseen
+    return bool(views.ranges_cm[at] > beyond_cm)

@@ -80,12 +80,12 @@ def test_edgar_mine_is_found_as_its_plan_knows_it() -> None:
         (np.linalg.norm(road.line_m[:, None, :2] - lines[None], axis=2).min(axis=1) < 2.0).mean()
         for road in plan.roadways
     ]
-    # three of 79 are blocked or are bays
-    assert np.sum(np.array(near) >= 0.8) >= 75
+    # two of 79 are blocked in this mesh, for the simulator too
+    assert np.sum(np.array(near) >= 0.8) >= 76
     ours = product.roadways.nodes_m[product.roadways.intersections, :2] - GRID[:2]
     known = plan.nodes_m[plan.intersections, :2]
     apart = np.linalg.norm(known[:, None] - ours[None], axis=2)
-    assert (apart.min(axis=1) < 4.0).sum() >= 38
+    assert (apart.min(axis=1) < 4.0).sum() >= 39
     assert len(ours) <= 50
     assert product.coverage.complete_share > 0.97
     worst, _ = _wall_quality(product, flown, mine)
