@@ -64,6 +64,8 @@ def free_sheet_of_map(
     columns = columns_of(cloud, origin, cell_m)
     which, floor, roof = find_gaps(columns, headroom_m)
     number = columns.number[which]
+    whole = ~holds_two(number, floor, roof, opening_m)
+    number, floor, roof = number[whole], floor[whole], roof[whole]
     sheet = _sheet(cell_m, origin, number % WIDE, number // WIDE, floor, roof, opening_m)
     for _ in range(GROWTHS):
         before = len(sheet)
@@ -155,6 +157,30 @@ def find_gaps(columns: Columns, headroom_m: float) -> tuple[I64, F64, F64]:
                 which[count], floor[count], roof[count] = c, low[0], high[0]
                 count += 1
     return which[:count], floor[:count], roof[:count]
+
+
+@njit(cache=True)
+def holds_two(number: I64, floor_m: F64, roof_m: F64, opening_m: float) -> Bool:
+    """(n,) gaps that open into two gaps over one another beside them: there the rock between them was not seen.
+
+    One such column would join the levels.
+
+    Args:
+        number: (n,) of the columns, rising.
+        floor_m, roof_m: (n,).
+        opening_m: least overlap.
+    """
+    out = np.zeros(len(number), np.bool_)
+    for i in range(len(number)):
+        for k in range(8):
+            beside = number[i] + DY[k] * WIDE + DX[k]
+            j = np.searchsorted(number, beside)
+            shared = 0
+            while j < len(number) and number[j] == beside:
+                shared += min(roof_m[i], roof_m[j]) - max(floor_m[i], floor_m[j]) >= opening_m
+                j += 1
+            out[i] |= shared >= 2
+    return out
 
 
 @njit(cache=True)

@@ -66,6 +66,31 @@ def test_levels_over_one_another_are_told_apart_and_rock_between_is_no_roadway()
     assert len(nobody) == len(both) // 2
 
 
+def test_a_hole_in_the_rock_between_two_levels_does_not_join_them() -> None:
+    lower = RasterMine(plan((30, 30), (2, 28, 13, 17)), np.zeros((300, 300)))
+    upper = RasterMine(plan((30, 30), (13, 17, 2, 28)), np.full((300, 300), 5.0))
+    cloud = cloud_of(lower, upper)
+    x, y, z = cloud.points_m.T
+    # neither the roof below nor the floor above was seen within half a metre
+    hole = (np.hypot(x - 15, y - 15) < 0.3) & (z > 2.5) & (z < 5.5)
+    sheet = free_sheet_of_map(cloud.keep(~hole), np.array([[5.0, 15.0, 1.5]]))
+    np.testing.assert_allclose(sheet.floor_m, 0.0, atol=0.05)
+    np.testing.assert_allclose(sheet.roof_m, 3.0, atol=0.05)
+
+
+def test_dust_closes_no_gap(tee: MapCloud) -> None:
+    """Grains seen twice in every second column where a drone flies."""
+    rng = np.random.default_rng(8)
+    grains = np.column_stack([rng.uniform(3, 37, 1200), rng.uniform(8.5, 11.5, 1200), rng.uniform(0.8, 2.2, 1200)])
+    grains[:, 2] += 0.1 * grains[:, 0]
+    n = len(tee)
+    dusty = tee.keep(np.concatenate([np.arange(n), np.zeros(1200, np.int64)]))
+    visits = np.concatenate([tee.visits, np.full(1200, 2, np.int32)])
+    points = np.concatenate([tee.points_m, grains.astype(np.float32)])
+    clean, found = (free_sheet_of_map(cloud, FLOWN) for cloud in (tee, replace(dusty, points_m=points, visits=visits)))
+    assert len(found) == pytest.approx(len(clean), abs=8)
+
+
 def test_holes_are_closed_and_a_floor_without_its_roof_is_believed_for_a_little(tee: MapCloud) -> None:
     x, y = (tee.points_map - GRID)[:, :2].T
     whole = free_sheet_of_map(tee, FLOWN)
