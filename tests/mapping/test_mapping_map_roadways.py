@@ -86,6 +86,7 @@ def test_a_curtain_of_dust_closes_no_roadway(tee: MapCloud) -> None:
     dusty = replace(
         tee.keep(np.concatenate([np.arange(len(tee)), np.zeros(len(grains), np.int64)])),
         points_m=np.concatenate([tee.points_m, grains]),
+        normals=np.concatenate([tee.normals, np.tile(np.float32([1, 0, 0]), (len(grains), 1))]),
         visits=np.concatenate([tee.visits, np.full(len(grains), 2, np.int32)]),
     )
     assert len(free_sheet_of_map(dusty, FLOWN)) == pytest.approx(len(free_sheet_of_map(tee, FLOWN)), abs=4)
