@@ -153,15 +153,20 @@ def decode_camera_info(data: bytes | memoryview) -> CameraModel:
     return camera_of(STORE.deserialize_cdr(data, CAMERA_INFO))
 
 
-def camera_of(message: object) -> CameraModel:
+def camera_of(message: object, *, rectified: bool = False) -> CameraModel:
     """The geometry in a decoded CameraInfo; its distortion is not looked at.
+
+    Args:
+        message: of ROS 1 or 2.
+        rectified: of the images that image_proc makes, which have the geometry of P.
 
     Raises:
         ValueError: it is that of no camera.
     """
     info = cast("Any", message)
-    k = info.k if hasattr(info, "k") else info.K  # ROS 1 has capitals
-    return CameraModel(int(info.width), int(info.height), float(k[0]), float(k[4]), float(k[2]), float(k[5]))
+    k, p = (info.k, info.p) if hasattr(info, "k") else (info.K, info.P)  # ROS 1 has capitals
+    fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if rectified else (k[0], k[4], k[2], k[5])
+    return CameraModel(int(info.width), int(info.height), float(fx), float(fy), float(cx), float(cy))
 
 
 def camera_json(camera: CameraModel) -> str:

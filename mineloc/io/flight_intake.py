@@ -2,39 +2,33 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import closing, suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from contextlib import closing
 from typing import Any, cast
 
 import numpy as np
 
 from mineloc.config import IngestConfig
-from mineloc.data import Calibration, FlightInfo
 from mineloc.errors import IngestError
 from mineloc.io import flight_layout as layout
-from mineloc.io.depth_intake import DepthIntake, DepthTopic, find_depth, why_left_out
 from mineloc.io.findings import Finding
+from mineloc.io.flight_plan import Plan
 from mineloc.io.flight_writer import FlightWriter
-from mineloc.io.grey_intake import GreyIntake
 from mineloc.io.health import Health, HealthFinding, Severity, sorted_findings
+from mineloc.io.image_intake import CanonicalGreyIntake, ImageIntake
 from mineloc.io.imu_monitor import ImuMonitor
 from mineloc.io.intake import ImuIntake, Intake, LidarIntake, PoseIntake
 from mineloc.io.messages import ImuDecoder, PoseDecoder
 from mineloc.io.motion_watch import MotionWatch
 from mineloc.io.recording import RawMessage, Recording, Topic
-from mineloc.io.ros import TF_MESSAGE
+from mineloc.io.ros_images import depth_image, grey_image
 from mineloc.io.sequence import ReferenceRules, Sequence
-from mineloc.io.static_frames import StaticFrames, frame_name
 from mineloc.io.sweep_decoder import SweepDecoder
 from mineloc.io.topic_monitor import TopicMonitor
-from mineloc.io.topic_roles import Roles, choose_roles
 
 _NS = 1e-9
 # A clock that goes back further was set anew: leaving out what is repeated would leave out the flight.
 _DEEPEST_NS = 1_000_000_000
-_TF_STATIC_SPAN_NS = 10_000_000_000
 # What ingest does as a matter of course; everything else that a decoder finds is a warning.
 _INFO = frozenset(
     {"points_not_finite", "points_at_origin", "point_times", "header_at_end", "rings_recovered", "rings_renamed"}
@@ -42,113 +36,6 @@ _INFO = frozenset(
 )
 # The topic monitors tell these with more detail.
 _TOLD_BY_MONITOR = frozenset({"imu_time_not_increasing", "pose_time_not_increasing"})
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Plan:
-    """What a recording will become.
-
-    Attributes:
-        roles: which topic is what.
-        info, calibration: facts for the flight.
-        remarks: where they come from, one finding each.
-        earlier: the health record of a recording that is a flight already.
-        depth: the topic of depth images that can be used.
-    """
-
-    roles: Roles
-    info: FlightInfo
-    calibration: Calibration
-    remarks: tuple[HealthFinding, ...]
-    earlier: Mapping[str, Any] | None
-    depth: DepthTopic | None = None
-
-
-def plan_flight(recording: Recording, told: Sequence) -> Plan:
-    """Decide what each topic is and where the sensors sit.
-
-    Args:
-        recording: opened.
-        told: the sequence file; an empty one if there is none.
-
-    Raises:
-        IngestError: ambiguous, missing or undecodable topics.
-    """
-    roles = choose_roles(recording.path, recording.topics, told.topics)
-    depth, assumed = find_depth(recording, told.topics.depth)
-    remarks = [*(HealthFinding("topic_assumed", "info", 1, line) for line in roles.assumed), *assumed]
-    facts = _own_facts(recording)
-    info = told.flight_info(source=recording.path.name)
-    calibration, earlier = told.calibration, None
-    if facts is not None:
-        own, calibration, earlier = facts
-        remarks = []  # the topics of a flight are what they are called
-        info = _override(own, info)
-    if "T_body" in told.model_fields_set:
-        calibration = told.calibration
-    elif facts is None and (found := _static_calibration(recording, roles, depth)) is not None:
-        calibration, body = found
-        line = f"sensors are placed by /tf_static: {body} counts as the body"
-        remarks.append(HealthFinding("calibration_from_tf", "info", 1, line))
-    if (
-        depth is not None
-        and (left_out := why_left_out(depth, placed=calibration.T_body_camera is not None)) is not None
-    ):
-        remarks.append(left_out)
-        depth = None
-    return Plan(roles, info, calibration, tuple(remarks), earlier, depth)
-
-
-def _own_facts(recording: Recording) -> tuple[FlightInfo, Calibration, Mapping[str, Any]] | None:
-    """What a recording that is a flight already says about itself."""
-    record = recording.metadata.get(layout.FLIGHT_RECORD)
-    if record is None:
-        return None
-    info, calibration, _, _ = layout.decode_info(recording.path, record)
-    text = recording.metadata.get(layout.HEALTH_RECORD, {}).get("json", "{}")
-    try:
-        health: object = json.loads(text)
-    except ValueError:
-        health = {}
-    return info, calibration, cast("Mapping[str, Any]", health) if isinstance(health, dict) else {}
-
-
-def _override(own: FlightInfo, told: FlightInfo) -> FlightInfo:
-    """The flight's own facts, except where a sequence file says otherwise; the source stays the first one."""
-    values = {name: getattr(told, name) or getattr(own, name) for name in FlightInfo.__dataclass_fields__}
-    return FlightInfo(**{**values, "source": own.source or told.source})
-
-
-def _static_calibration(recording: Recording, roles: Roles, depth: DepthTopic | None) -> tuple[Calibration, str] | None:
-    names = [t.name for t in recording.topics.values() if t.msgtype == TF_MESSAGE and t.name.endswith("tf_static")]
-    if not names:
-        return None
-    frames = StaticFrames()
-    until_ns: int | None = None
-    # latched transforms stand at the beginning; some systems repeat them until the end
-    with closing(_stream(recording, names)) as messages:
-        for raw in messages:
-            until_ns = raw.log_ns + _TF_STATIC_SPAN_NS if until_ns is None else until_ns
-            if raw.log_ns > until_ns:
-                break
-            with suppress(IngestError):  # one that does not decode places nothing
-                frames.add(raw.message)
-    camera = "" if depth is None else depth.frame
-    return frames.calibration(_frame_of(recording, roles.lidar), _frame_of(recording, roles.imu), camera)
-
-
-def _frame_of(recording: Recording, topic: Topic | None) -> str:
-    if topic is None:
-        return ""
-    with closing(_stream(recording, [topic.name])) as messages:
-        for raw in messages:
-            with suppress(IngestError):
-                return frame_name(raw.message.header.frame_id)
-    return ""
-
-
-def _stream(recording: Recording, names: Iterable[str]) -> Any:
-    return recording.messages(list(names))
 
 
 class FlightIntake:
@@ -190,12 +77,22 @@ class FlightIntake:
             monitor = TopicMonitor("odometry", roles.odometry)
             poses = self._pose_decoder(roles.odometry, ReferenceRules(), np.eye(4), layout.ODOM_FRAME)
             self._takers[roles.odometry.name] = PoseIntake(monitor, poses, writer.add_odometry, None)
-        if plan.depth is not None and plan.depth.camera is not None:
-            topic = plan.depth.topic
-            self._takers[topic.name] = DepthIntake(TopicMonitor("depth", topic), plan.depth.camera, writer)
-        grey = recording.topics.get(layout.GREY)
-        if grey is not None and plan.earlier is not None and plan.calibration.T_body_camera is not None:
-            self._takers[grey.name] = GreyIntake(TopicMonitor("grey", grey), writer)
+        self._take_images(writer)
+
+    def _take_images(self, writer: FlightWriter) -> None:
+        depth, grey = self._plan.depth, self._plan.grey
+        if depth is not None and depth.camera is not None:
+            monitor = TopicMonitor("depth", depth.topic)
+            self._takers[depth.topic.name] = ImageIntake(monitor, depth.camera, depth_image, writer.add_depth)
+        if grey is not None and grey.camera is not None:
+            monitor = TopicMonitor("grey", grey.topic)
+            # what is JPEG in a flight already would lose a little more
+            as_it_is = self._plan.earlier is not None and grey.topic.name == layout.GREY
+            self._takers[grey.topic.name] = (
+                CanonicalGreyIntake(monitor, writer)
+                if as_it_is
+                else ImageIntake(monitor, grey.camera, grey_image, writer.add_grey)
+            )
 
     def _where(self, topic: Topic) -> str:
         return f"{self._recording.path}: {topic.name}"
@@ -210,7 +107,7 @@ class FlightIntake:
             IngestError: clouds that cannot be understood, wrong units, time that goes back by more than a second.
         """
         # absurd values overflow; what comes of them is looked at
-        with closing(_stream(self._recording, self._takers)) as messages, np.errstate(all="ignore"):
+        with closing(cast("Any", self._recording.messages(list(self._takers)))) as messages, np.errstate(all="ignore"):
             for raw in messages:
                 taker = self._takers[raw.topic]
                 taker.take(raw)

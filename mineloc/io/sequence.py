@@ -26,6 +26,9 @@ class Topics(Section):
     reference: str = Field(default="", description="Odometry, PoseStamped, PoseWithCovarianceStamped or TF")
     odometry: str = Field(default="", description="odometry kept beside the reference")
     depth: str = Field(default="", description="Image, 16UC1 or 32FC1, with CameraInfo beside it")
+    grey: str = Field(
+        default="", description="Image, grey or colour, or CompressedImage (JPEG), with CameraInfo beside"
+    )
 
 
 class LidarRules(Section):

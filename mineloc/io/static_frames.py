@@ -21,6 +21,11 @@ class StaticFrames:
     def __init__(self) -> None:
         self._edges: dict[str, dict[str, F64]] = {}
 
+    @property
+    def empty(self) -> bool:
+        """Whether nothing is known."""
+        return not self._edges
+
     def add(self, message: object) -> None:
         """Take a decoded tf2_msgs/TFMessage; transforms that are not rigid are left out."""
         for transform in cast("Iterable[Any]", cast("Any", message).transforms):

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from mineloc.config import Config
 from mineloc.errors import OutputError
-from mineloc.io.flight_intake import FlightIntake, plan_flight
+from mineloc.io.flight_intake import FlightIntake
+from mineloc.io.flight_plan import plan_flight
 from mineloc.io.flight_writer import FlightWriter
 from mineloc.io.health import Health, HealthFinding
 from mineloc.io.recording import RawMessage, Recording, Topic

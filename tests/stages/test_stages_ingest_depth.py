@@ -2,83 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 import driver_clouds as drivers
 import numpy as np
 import pytest
 import recording_files as files
-from recording_files import CLOUD, ROS2, START_NS, STEP_NS, TF
+from camera_recordings import CAMERA, TOPIC, base, depths, image, infos, millimetres, placed, run
+from recording_files import ROS2, START_NS, STEP_NS
 
 from mineloc import se3
-from mineloc.data import Calibration, CameraModel, DepthImage, FlightInfo, GreyImage
+from mineloc.data import Calibration, DepthImage, FlightInfo, GreyImage
 from mineloc.errors import IngestError
-from mineloc.io.depth_intake import depth_image
 from mineloc.io.flight import FlightReader, FlightWriter
 from mineloc.io.health import Health
 from mineloc.io.ros import CAMERA_INFO, IMAGE
+from mineloc.io.ros_images import depth_image
 from mineloc.stages.ingest import ingest
-
-CAMERA = CameraModel(10, 6, 8.0, 8.5, 4.5, 2.5)
-FRAME = "camera_depth_optical_frame"
-TOPIC, INFO = "/camera/depth/image_rect_raw", "/camera/depth/camera_info"
-
-
-def _millimetres(seed: int) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 9000, (6, 10)).astype(np.uint16)
-
-
-def _image(stamp_ns: int, values: np.ndarray, encoding: str, *, pad: int = 0, big: bool = False) -> Any:
-    values = values.astype(values.dtype.newbyteorder(">" if big else "<"))
-    rows = np.ascontiguousarray(values).view(np.uint8).reshape(len(values), -1)
-    data = np.pad(rows, ((0, 0), (0, pad)), constant_values=7)
-    at = files.header(ROS2.types, stamp_ns, FRAME)
-    return ROS2.types[IMAGE](at, *values.shape, encoding, int(big), data.shape[1], data.ravel())
-
-
-def _info(stamp_ns: int, *, distortion: float = 0.0, width: int = 10) -> Any:
-    types = ROS2.types
-    k = np.array([8.0, 0, 4.5, 0, 8.5, 2.5, 0, 0, 1])
-    region = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-    at = files.header(types, stamp_ns, FRAME)
-    d = np.full(5, distortion)
-    return types[CAMERA_INFO](at, 6, width, "plumb_bob", d, k, np.eye(3).ravel(), np.zeros(12), 0, 0, region)
-
-
-def _depths(count: int = 5, *, topic: str = TOPIC, encoding: str = "16UC1", **options: Any) -> list[files.Entry]:
-    out: list[files.Entry] = []
-    for i in range(count):
-        mm = _millimetres(i)
-        values = mm if encoding != "32FC1" else np.where(mm == 0, np.nan, mm / 1000).astype(np.float32)
-        stamp = START_NS + 30_000_000 + i * STEP_NS
-        out.append((topic, IMAGE, stamp + 1000, _image(stamp, values, encoding, **options)))
-    return out
-
-
-def _infos(**options: Any) -> list[files.Entry]:
-    return [(INFO, CAMERA_INFO, START_NS + i, _info(START_NS + i, **options)) for i in range(2)]
-
-
-def _base() -> list[files.Entry]:
-    made = [drivers.vlp16_sweep(START_NS + i * STEP_NS, columns=40, seed=i) for i in range(6)]
-    return [("/points", CLOUD, s.end_ns + 1, drivers.velodyne(s)) for s in made]
-
-
-def _placed(child: str = FRAME) -> list[files.Entry]:
-    edges = [("base_link", "velodyne", (0, 0, 1)), ("base_link", "lidar", (0, 0, 1)), ("lidar", child, (0.2, 0, -0.1))]
-    return [("/tf_static", TF, START_NS - 1, files.transforms(START_NS, *edges))]
-
-
-def _run(tmp_path: Path, *groups: list[files.Entry], told: str = "") -> tuple[Path, Health]:
-    entries = sorted((entry for group in groups for entry in group), key=lambda entry: entry[2])
-    path = files.write_mcap(tmp_path / "recording.mcap", entries)
-    sequence = None
-    if told:
-        sequence = tmp_path / "sequence.toml"
-        sequence.write_text(told)
-    out = tmp_path / "flight.mcap"
-    return out, ingest(path, out=out, sequence=sequence).health
 
 
 def _left_out(health: Health) -> list[str]:
@@ -87,7 +25,7 @@ def _left_out(health: Health) -> list[str]:
 
 @pytest.mark.parametrize("options", [{}, {"encoding": "32FC1"}, {"big": True, "pad": 4}], ids=str)
 def test_depth_comes_into_the_flight(tmp_path, options) -> None:
-    out, health = _run(tmp_path, _base(), _depths(**options), _infos(), _placed())
+    out, health = run(tmp_path, base(), depths(**options), infos(), placed())
     assert not _left_out(health)
     depth = health.topics[-1]
     assert (depth.role, depth.topic, depth.used) == ("depth", TOPIC, 5)
@@ -98,9 +36,9 @@ def test_depth_comes_into_the_flight(tmp_path, options) -> None:
         images = list(reader.depth_images())
         assert reader.sweep_count == 6
     assert [i.stamp_ns for i in images] == [START_NS + 30_000_000 + i * STEP_NS for i in range(5)]
-    for seed, image in enumerate(images):
-        assert image.camera == CAMERA
-        np.testing.assert_array_equal(np.rint(image.depth_m * 1000), _millimetres(seed))
+    for seed, found in enumerate(images):
+        assert found.camera == CAMERA
+        np.testing.assert_array_equal(np.rint(found.depth_m * 1000), millimetres(seed))
 
 
 def test_depth_comes_out_of_a_bag_too(tmp_path) -> None:
@@ -108,7 +46,7 @@ def test_depth_comes_out_of_a_bag_too(tmp_path) -> None:
     types = files.ROS1.types
     region = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
     entries = []
-    for topic, kind, log, message in [*_infos(), *_base(), *_depths()]:
+    for topic, kind, log, message in [*infos(), *base(), *depths()]:
         values = [getattr(message, name) for name in message.__dataclass_fields__ if not name.startswith("__")]
         values[0] = files.header(types, log, message.header.frame_id, seq=0)
         if kind == CAMERA_INFO:
@@ -121,20 +59,20 @@ def test_depth_comes_out_of_a_bag_too(tmp_path) -> None:
     with FlightReader(tmp_path / "flight.mcap") as reader:
         images = list(reader.depth_images())
     assert [image.camera for image in images] == [CAMERA] * 5
-    np.testing.assert_array_equal(np.rint(images[3].depth_m * 1000), _millimetres(3))
+    np.testing.assert_array_equal(np.rint(images[3].depth_m * 1000), millimetres(3))
 
 
 @pytest.mark.parametrize(
     ("groups", "why"),
     [
-        ((_infos(),), "nothing places camera_depth_optical_frame"),
-        ((_infos(), _placed("other")), "nothing places"),
-        ((_placed(),), "no CameraInfo on /camera/depth/camera_info"),
-        ((_infos(distortion=0.1), _placed()), "distortion"),
+        ((infos(),), "nothing places camera_depth_optical_frame"),
+        ((infos(), placed("other")), "nothing places"),
+        ((placed(),), "no CameraInfo on /camera/depth/camera_info"),
+        ((infos(distortion=0.1), placed()), "distortion"),
     ],
 )
 def test_depth_of_which_too_little_is_known_is_left_out_with_one_finding(tmp_path, groups, why) -> None:
-    out, health = _run(tmp_path, _base(), _depths(), *groups)
+    out, health = run(tmp_path, base(), depths(), *groups)
     (line,) = _left_out(health)
     assert why in line
     with FlightReader(out) as reader:
@@ -143,41 +81,38 @@ def test_depth_of_which_too_little_is_known_is_left_out_with_one_finding(tmp_pat
 
 
 def test_a_sequence_file_places_the_camera_and_names_the_topic(tmp_path) -> None:
-    more = _depths(topic="/other/depth/image")
-    out, health = _run(tmp_path, _base(), _depths(), more, _infos(), _placed())
+    more = depths(topic="/other/depth/image")
+    out, health = run(tmp_path, base(), depths(), more, infos(), placed())
     assert any("could be any of" in finding.detail for finding in health.findings)
-    out.unlink()
     told = f'[topics]\ndepth = "{TOPIC}"\n[T_body.camera]\ntranslation_m = [1, 2, 3]'
-    out, health = _run(tmp_path, _base(), _depths(), more, _infos(), told=told)
+    out, health = run(tmp_path, base(), depths(), more, infos(), told=told)
     assert not _left_out(health)
     with FlightReader(out) as reader:
         assert reader.depth_count == 5
         assert reader.calibration.T_body_camera is not None
         np.testing.assert_allclose(reader.calibration.T_body_camera[:3, 3], [1, 2, 3])
-    out.unlink()
-    out, health = _run(tmp_path, _base(), _depths(), told='[topics]\ndepth = "none"')
+    out, health = run(tmp_path, base(), depths(), told='[topics]\ndepth = "none"')
     assert not _left_out(health)
-    out.unlink()
     with pytest.raises(IngestError, match="no depth images on /nowhere"):
-        _run(tmp_path, _base(), _depths(), told='[topics]\ndepth = "/nowhere"')
+        run(tmp_path, base(), depths(), told='[topics]\ndepth = "/nowhere"')
 
 
 def test_colour_images_are_no_depth(tmp_path) -> None:
     colour = [
-        (topic, IMAGE, START_NS + i, _image(START_NS + i, np.zeros((6, 30), np.uint8), "rgb8"))
+        (topic, IMAGE, START_NS + i, image(START_NS + i, np.zeros((6, 30), np.uint8), "rgb8"))
         for i, topic in enumerate(["/camera/color/image_raw", "/camera/depth/preview"])
     ]
-    out, health = _run(tmp_path, _base(), colour, _placed())
+    out, health = run(tmp_path, base(), colour, placed())
     assert not _left_out(health)
     with FlightReader(out) as reader:
         assert reader.depth_count == 0
 
 
 def test_images_of_another_size_and_old_ones_are_left_out_and_counted(tmp_path) -> None:
-    depths = _depths()
-    depths[2] = (TOPIC, IMAGE, depths[2][2], _image(depths[2][2] - 1000, np.ones((5, 10), np.uint16), "16UC1"))
-    topic, kind, log, message = depths[1]
-    out, health = _run(tmp_path, _base(), depths, [(topic, kind, log + 1, message)], _infos(), _placed())
+    taken = depths()
+    taken[2] = (TOPIC, IMAGE, taken[2][2], image(taken[2][2] - 1000, np.ones((5, 10), np.uint16), "16UC1"))
+    topic, kind, log, message = taken[1]
+    out, health = run(tmp_path, base(), taken, [(topic, kind, log + 1, message)], infos(), placed())
     found = {finding.name: finding.count for finding in health.findings}
     assert (found["depth_unreadable"], found["depth_duplicates"]) == (1, 1)
     with FlightReader(out) as reader:
@@ -186,11 +121,11 @@ def test_images_of_another_size_and_old_ones_are_left_out_and_counted(tmp_path) 
 
 def test_a_flight_with_images_ingests_to_an_equal_flight(tmp_path) -> None:
     calibration = Calibration(se3.exp(np.arange(6) * 0.1), np.eye(4), se3.exp(np.arange(6) * 0.2))
-    depths = [DepthImage(START_NS + i * STEP_NS, (_millimetres(i) / 1000).astype(np.float32), CAMERA) for i in range(6)]
+    depths = [DepthImage(START_NS + i * STEP_NS, (millimetres(i) / 1000).astype(np.float32), CAMERA) for i in range(6)]
     with FlightWriter(tmp_path / "flown.mcap", FlightInfo(flight="7"), calibration) as writer:
         for i, image in enumerate(depths):
             writer.add_depth(image)
-            writer.add_grey(GreyImage(image.stamp_ns + 5, (_millimetres(i) % 251).astype(np.uint8), CAMERA))
+            writer.add_grey(GreyImage(image.stamp_ns + 5, (millimetres(i) % 251).astype(np.uint8), CAMERA))
             writer.add_sweep(drivers.vlp16_sweep(START_NS + i * STEP_NS, columns=40, seed=i))
     health = ingest(tmp_path / "flown.mcap", out=tmp_path / "again.mcap").health
     assert not _left_out(health)
@@ -207,8 +142,8 @@ def test_a_flight_with_images_ingests_to_an_equal_flight(tmp_path) -> None:
 
 
 def test_what_is_no_depth_image_is_refused() -> None:
-    good = _image(START_NS, _millimetres(0), "16UC1")
-    np.testing.assert_array_equal(np.rint(depth_image(good, CAMERA).depth_m * 1000), _millimetres(0))
+    good = image(START_NS, millimetres(0), "16UC1")
+    np.testing.assert_array_equal(np.rint(depth_image(good, CAMERA).depth_m * 1000), millimetres(0))
     for change in ({"encoding": "rgb8"}, {"width": 9}, {"step": 19}, {"height": 7}, {"data": np.zeros(5, np.uint8)}):
         values = {
             name: getattr(good, name)
