@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -105,6 +106,23 @@ def test_other_programs_read_them(flight):
     assert placed.keys() == {"lidar", "imu", "camera"}
 
 
+def test_rerun_shows_depth_through_the_camera(flight):
+    """As `rerun flight.mcap` does it: a depth image in the image plane of a pinhole that `/tf_static` places."""
+    chunk = pytest.importorskip("rerun.chunk")
+    found = {}
+    for part in chunk.McapReader(str(flight), include_topic_regex=["/camera/depth/.*"]).stream():
+        columns = part.to_record_batch().to_pydict()
+        found.setdefault(str(part.entity_path), {}).update(columns)
+    shown, pinhole = found["/camera/depth/image"], found["/camera/depth/camera_info"]
+    # no DepthImage:meter: whole numbers count as millimetres
+    assert "DepthImage:meter" not in shown
+    mm = np.frombuffer(bytes(shown["DepthImage:buffer"][-1][0]), "<u2").reshape(CAMERA.height_px, CAMERA.width_px)
+    np.testing.assert_array_equal(mm, np.rint(DEPTHS[-1].depth_m * 1000.0).astype(int))
+    assert pinhole["Pinhole:parent_frame"] == [["camera"]]
+    assert pinhole["Pinhole:child_frame"][0] == shown["CoordinateFrame:frame"][-1]
+    np.testing.assert_allclose(np.reshape(pinhole["Pinhole:image_from_camera"], (3, 3)).T[0], [20, 0, 11.5])
+
+
 def test_chunks_hold_one_kind_in_order_of_time(flight):
     with flight.open("rb") as stream:
         summary = make_reader(stream).get_summary()
@@ -139,6 +157,33 @@ def test_images_may_come_without_sweeps_or_late(tmp_path):
         for found, made in zip(reader.depth_images(), many, strict=True):
             np.testing.assert_array_equal(found.depth_m, made.depth_m)
         assert len(list(reader.steps())) == 8
+
+
+def test_memory_does_not_grow_with_the_images(tmp_path):
+    """36 MB of images that no sweep follows: 16 wait, a few lie in chunks that are being packed, 4 are read ahead."""
+    camera = CameraModel(320, 240, 200.0, 200.0, 159.5, 119.5)
+    one = _depth(EPOCH_NS, camera=camera)
+    image_bytes = 2 * one.depth_m.size
+
+    def peak() -> int:
+        _, most = tracemalloc.get_traced_memory()
+        tracemalloc.reset_peak()
+        return most
+
+    tracemalloc.start()
+    try:
+        with FlightWriter(tmp_path / "f.mcap", FlightInfo(), CALIBRATION, chunk_bytes=1 << 16) as writer:
+            for i in range(240):
+                writer.add_depth(replace(one, stamp_ns=EPOCH_NS + i * STEP_NS))
+        written = peak()
+        with FlightReader(tmp_path / "f.mcap") as reader:
+            assert sum(1 for _ in reader.depth_images()) == 240
+        read = peak()
+    finally:
+        tracemalloc.stop()
+    assert 16 * image_bytes < written < 40 * image_bytes
+    # decoded they are twice as large
+    assert 4 * 2 * image_bytes < read < 40 * image_bytes
 
 
 def test_a_camera_may_change(tmp_path):
