@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
 
 from mineloc import se3
-from mineloc.data import F64, Keyframe, RelativePose
+from mineloc.data import F64, Calibration, FlightInfo, Keyframe, RelativePose, Sweep, Trajectory
+from mineloc.io.flight import FlightWriter
 
 WIDTH_M, HEIGHT_M, REACH_M = 4.0, 3.0, 12.0
 _AROUND = 40
+START_NS = 1_700_000_000_000_000_000
 
 
 @dataclass(frozen=True)
@@ -80,3 +83,29 @@ def fly_along(
         keyframes.append(Keyframe(k, k * 1_000_000_000, T_odom, mine.seen_from(T, rng)))
         edges.append(edge)
     return Drifted(keyframes, edges, truth)
+
+
+def write_flight(
+    path: Path, line_m: F64, mine: WallPoints, *, seed: int, name: str = "rough", shift: F64 | None = None
+) -> F64:
+    """A canonical flight along a line with 0.4 m a sweep, instant sweeps, no IMU; the true poses of its sweeps.
+
+    Args:
+        shift: (4, 4) the reference is told in another frame: `shift @ truth`.
+    """
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line_m, axis=0), axis=1))])
+    at = np.arange(0.0, along[-1], 0.4)
+    way = np.column_stack([np.interp(at, along, line_m[:, k]) for k in range(3)])
+    ahead = np.gradient(way, axis=0)
+    xi = np.zeros((len(way), 6))
+    xi[:, 2] = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
+    truth = se3.exp(xi)
+    truth[:, :3, 3] = way
+    rng = np.random.default_rng(seed)
+    stamps = START_NS + np.arange(len(way), dtype=np.int64) * 100_000_000
+    told = truth if shift is None else shift @ truth
+    with FlightWriter(path, FlightInfo(flight=name), Calibration()) as writer:
+        writer.add_reference(Trajectory(stamps, told))
+        for stamp, T in zip(stamps.tolist(), truth, strict=True):
+            writer.add_sweep(Sweep(stamp, mine.seen_from(T, rng)))
+    return truth
