@@ -22,7 +22,7 @@ demo: .stamps/product
 	$(BIN)/mineloc demo
 
 test: .stamps/dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 
 lint: .stamps/dev
 	$(BIN)/ruff check .
