@@ -16,6 +16,7 @@ from mineloc.config import GraphConfig
 from mineloc.data import F64, I64, Bool, RelativePose
 from mineloc.graph.noise import edge_noise
 
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
     """Where keyframe j is expected, seen from keyframe i.
