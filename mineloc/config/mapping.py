@@ -50,7 +50,33 @@ class LoopsConfig(Section):
 
 
 class FusionConfig(Section):
-    """Fusion of depth images with LiDAR ranges (METHOD 6.1)."""
+    """Fusion of depth images with LiDAR ranges (METHOD 6.1). Pixels are those of the images."""
+
+    every_m: float = Field(default=1.0, gt=0, description="way between images that are fused")
+    baseline_m: float = Field(default=0.05, gt=0, description="of the stereo pair")
+    white_px: float = Field(default=0.08, gt=0, description="noise of the disparity, a pixel for itself")
+    patchy_px: float = Field(default=0.07, gt=0, description="noise of the disparity in patches, as a first guess")
+    patch_range_px: float = Field(default=12.0, gt=0, description="range of its exponential covariance, first guess")
+    drift_px: float = Field(default=0.5, gt=0, description="prior of the drift: disparity error at the image's centre")
+    drift_slope_px: float = Field(default=0.3, ge=0, description="prior of its change from the centre to the border")
+    lidar_sigma_m: float = Field(default=0.02, gt=0)
+    relief_m: float = Field(default=0.012, ge=0, description="relief of the rock that smoothing takes away, one sigma")
+    window_px: int = Field(default=4, ge=1, le=12, description="half of the window of the affine smoothing")
+    edge_sigmas: float = Field(
+        default=4.0, gt=0, description="neighbours farther off are beyond an edge"
+    )
+    edge_slope: float = Field(default=0.03, ge=0, description="relative change of depth a pixel that is no edge")
+    neighbours: int = Field(default=12, ge=3, le=32)
+    stride_px: int = Field(default=4, ge=1, description="lattice on which the residual is kriged")
+    gap_px: float = Field(
+        default=14.0, gt=0, description="LiDAR alone fills holes of the camera so far from its points"
+    )
+    max_sigma_m: float = Field(default=0.05, gt=0, description="worse pixels do not enter the map")
+    variogram_lags: int = Field(default=12, ge=4)
+    variogram_reach_px: float = Field(default=60.0, gt=4)
+    variogram_share: float = Field(
+        default=0.1, gt=0, le=1, description="weight of a new image in the variogram"
+    )
 
 
 class ControlConfig(Section):
