@@ -62,9 +62,7 @@ class FusionConfig(Section):
     lidar_sigma_m: float = Field(default=0.02, gt=0)
     relief_m: float = Field(default=0.012, ge=0, description="relief of the rock that smoothing takes away, one sigma")
     window_px: int = Field(default=4, ge=1, le=12, description="half of the window of the affine smoothing")
-    edge_sigmas: float = Field(
-        default=4.0, gt=0, description="neighbours farther off are beyond an edge"
-    )
+    edge_sigmas: float = Field(default=4.0, gt=0, description="neighbours farther off are beyond an edge")
     edge_slope: float = Field(default=0.03, ge=0, description="relative change of depth a pixel that is no edge")
     neighbours: int = Field(default=12, ge=3, le=32)
     stride_px: int = Field(default=4, ge=1, description="lattice on which the residual is kriged")
@@ -74,9 +72,7 @@ class FusionConfig(Section):
     max_sigma_m: float = Field(default=0.05, gt=0, description="worse pixels do not enter the map")
     variogram_lags: int = Field(default=12, ge=4)
     variogram_reach_px: float = Field(default=60.0, gt=4)
-    variogram_share: float = Field(
-        default=0.1, gt=0, le=1, description="weight of a new image in the variogram"
-    )
+    variogram_share: float = Field(default=0.1, gt=0, le=1, description="weight of a new image in the variogram")
 
 
 class ControlConfig(Section):
