@@ -67,10 +67,14 @@ class DepthFusion:
     Args:
         config: noise, neighbourhoods.
         camera: of all images.
+
+    Attributes:
+        camera: as given.
     """
 
     def __init__(self, config: FusionConfig, camera: CameraModel) -> None:
-        self._config, self._camera = config, camera
+        self.camera = camera
+        self._config = config
         # a pixel of disparity in inverse depth: w = d / (f B)
         self._pixel = 1.0 / (camera.fx_px * config.baseline_m)
         slope = config.drift_slope_px * 2.0 / np.array([camera.width_px, camera.height_px])
@@ -92,9 +96,9 @@ class DepthFusion:
         Raises:
             ValueError: an image of another camera.
         """
-        need(depth.camera == self._camera, "an image of another camera")
+        need(depth.camera == self.camera, "an image of another camera")
         smooth, left = self._smoothed(depth)
-        lidar = project(points_lidar, T_camera_lidar, self._camera)
+        lidar = project(points_lidar, T_camera_lidar, self.camera)
         seen, error = self._errors(smooth, left, lidar)
         self._learn(seen, error)
         error_of, variance_of = self._kriged(smooth, seen, error)
@@ -137,7 +141,7 @@ class DepthFusion:
         c = self._config
         if len(seen) < 2 * c.neighbours:
             return
-        patches = self._camera.width_px * self._camera.height_px / (6.0 * self._range_px**2)
+        patches = self.camera.width_px * self.camera.height_px / (6.0 * self._range_px**2)
         total = self._sill + float(np.median(self._noise(seen)))
         self._mean, posterior = fit_drift(
             seen.places_px, error, total, mean=self._mean, prior=self._prior, count=max(patches, 3.0)
@@ -156,7 +160,7 @@ class DepthFusion:
         """(height, width) n and its variance: kriged on a lattice, bilinear between."""
         rows, columns = self._lattice
         v, u = (grid.ravel() for grid in np.meshgrid(rows, columns, indexing="ij"))
-        at = np.column_stack([u - self._camera.cx_px, v - self._camera.cy_px]).astype(np.float64)
+        at = np.column_stack([u - self.camera.cx_px, v - self.camera.cy_px]).astype(np.float64)
         near = self._neighbours(at, smooth[v, u], seen)
         found = krige_near(
             seen.places_px,
@@ -194,7 +198,7 @@ class DepthFusion:
         row, column = np.nonzero(inverse <= 0)
         if len(lidar) < DRIFT_NEEDS or not len(row):
             return
-        at = np.column_stack([column - self._camera.cx_px, row - self._camera.cy_px]).astype(np.float64)
+        at = np.column_stack([column - self.camera.cx_px, row - self.camera.cy_px]).astype(np.float64)
         gap, index = KDTree(lidar.places_px).query(at, k=min(_HOLE_NEIGHBOURS, len(lidar)))
         gap, index = gap.reshape(len(at), -1), np.asarray(index, dtype=np.int64).reshape(len(at), -1)
         around = lidar.inverse_depth[index]
@@ -227,7 +231,7 @@ class DepthFusion:
         depth = np.where(known, 1.0 / np.where(known, inverse, 1.0), 0.0)
         relief = self._config.relief_m
         sigma = np.where(known, np.sqrt(variance * depth**4 + relief**2), np.inf)
-        return FusedDepth(stamp_ns, depth.astype(np.float32), sigma.astype(np.float32), self._camera)
+        return FusedDepth(stamp_ns, depth.astype(np.float32), sigma.astype(np.float32), self.camera)
 
 
 DRIFT_NEEDS = 4

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from mineloc.config import ControlConfig
@@ -12,6 +12,7 @@ from mineloc.io.control_points import merged_control_points, read_control_points
 from mineloc.io.flight import FlightReader
 from mineloc.localize.reconstruction import Survey
 from mineloc.mapping.control import ControlTable
+from mineloc.mapping.tags import observe_tags
 
 
 def gathered_survey(
@@ -46,6 +47,7 @@ def gathered_survey(
     else:
         known = {point.name for point in points}
         seen = tuple(one for _, own in attached.values() for one in own if one.target in known)
+    seen += _seen_tags(readers, points, config)
     if not seen:
         raise ConfigError(
             control or "control points",
@@ -54,6 +56,20 @@ def gathered_survey(
             todo="give --observations, or leave the control points out (--no-control)",
         )
     return Survey(points, seen)
+
+
+def _seen_tags(
+    readers: Mapping[str, FlightReader], points: Sequence[ControlPoint], config: ControlConfig
+) -> tuple[Observation, ...]:
+    """What the grey images of the flights say of AprilTags among the targets."""
+    if all(point.tag_id is None for point in points):
+        return ()
+    out: list[Observation] = []
+    for name, reader in readers.items():
+        if reader.grey_count and reader.calibration.T_body_camera is not None:
+            found = observe_tags(reader.grey_images(), points, reader.calibration, config, flight=name)
+            out += found.observations
+    return tuple(out)
 
 
 def control_rmse(table: ControlTable) -> dict[str, float | None]:

@@ -15,10 +15,10 @@ import numpy as np
 
 from mineloc import se3
 from mineloc.config import Config
-from mineloc.data import Trajectory
+from mineloc.data import OdometryStep, Trajectory
 from mineloc.errors import ConfigError
 from mineloc.io.flight import FlightReader
-from mineloc.localize.flown import Flown, fly
+from mineloc.localize.flown import Flown, Watch, fly
 from mineloc.localize.localization import Clock, FlightData
 from mineloc.localize.method import Method, method_named
 from mineloc.localize.reconstruction import Reconstruction, reconstruct_flights
@@ -26,6 +26,7 @@ from mineloc.mapping.map_builder import MapBuilder
 from mineloc.mapping.survey_map import SurveyMap, survey_map
 from mineloc.output import new_folder
 from mineloc.progress import Progress, quiet
+from mineloc.stages.camera_pieces import CameraPieces
 from mineloc.stages.control_survey import control_rmse, gathered_survey
 from mineloc.stages.map_folder import write_map_folder
 from mineloc.stages.map_manifest import degenerate_m, manifest_of, timing_of
@@ -111,7 +112,7 @@ def reconstruct(
         work = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=folder)))
         readers = _opened(flights, stack)
         survey = gathered_survey(readers, control, observations, config.control) if use_control else None
-        flown, pieces = _flown(readers, chosen, config, work, progress)
+        flown, pieces = _flown(readers, chosen, config, work, progress, stack)
         with clock.of("graph"):
             found = reconstruct_flights(flown, config, closer=chosen.closer(config), survey=survey)
         with clock.of("map"):
@@ -154,7 +155,12 @@ def _opened(flights: Sequence[Path], stack: ExitStack) -> dict[str, FlightReader
 
 
 def _flown(
-    readers: Mapping[str, FlightReader], method: Method, config: Config, work: Path, progress: Progress
+    readers: Mapping[str, FlightReader],
+    method: Method,
+    config: Config,
+    work: Path,
+    progress: Progress,
+    stack: ExitStack,
 ) -> tuple[dict[str, Flown], list[MapPieces]]:
     """Every flight through the front end; its points wait in `work`."""
     total = sum(reader.sweep_count for reader in readers.values())
@@ -164,13 +170,29 @@ def _flown(
     for k, (name, reader) in enumerate(readers.items()):
         piece = MapPieces(work / f"{k}.points", voxel_m=config.map.piece_voxel_m, max_range_m=config.map.max_range_m)
 
+        watch = _watch(reader, piece, config, stack)
         front_end = method.make_front_end(config, reader.calibration)
         flight = FlightData(reader.steps(), reader.calibration)
-        flown[name] = fly(front_end, flight, config, progress=_offset(progress, before, total), watch=piece.watch)
+        flown[name] = fly(front_end, flight, config, progress=_offset(progress, before, total), watch=watch)
         piece.close()
         pieces.append(piece)
         before += reader.sweep_count
     return flown, pieces
+
+
+def _watch(reader: FlightReader, piece: MapPieces, config: Config, stack: ExitStack) -> Watch:
+    """What takes the points of a flight: the sweeps', and the camera's where there is one."""
+    if not reader.depth_count or reader.calibration.T_body_camera is None:
+        return piece.watch
+    # images and sweeps are read side by side: each from its own chunks
+    second = stack.enter_context(FlightReader(reader.path))
+    camera = CameraPieces(second.depth_images(), reader.calibration, config.fusion, piece)
+
+    def watch(step: OdometryStep) -> None:
+        piece.watch(step)
+        camera.watch(step)
+
+    return watch
 
 
 def _offset(progress: Progress, before: int, all_flights: int) -> Progress:
