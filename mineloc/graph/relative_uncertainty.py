@@ -101,6 +101,18 @@ class RelativeUncertainty:
         Mangelson et al., *Pairwise consistent measurement set maximization*, ICRA 2018. A pair agrees when the cycle's
         error is within three standard deviations a component, of the two closures and the odometry between.
         """
+        return self._consistent(one, self._moved(one.j, one), others, self._noise_of(others))
+
+    def agreement(self, loops: Sequence[RelativePose]) -> Bool:
+        """(n, n) whether each two of the closures agree, as `consistent`."""
+        noise = self._noise_of(loops)
+        rows = [self._consistent(loop, own, loops, noise) for loop, own in zip(loops, noise, strict=True)]
+        return np.array(rows, np.bool_).reshape(len(loops), len(loops))
+
+    def _noise_of(self, loops: Sequence[RelativePose]) -> F64:
+        return np.array([self._moved(loop.j, loop) for loop in loops]).reshape(-1, 6, 6)
+
+    def _consistent(self, one: RelativePose, noise: F64, others: Sequence[RelativePose], their_noise: F64) -> Bool:
         if not others:
             return np.zeros(0, np.bool_)
         i, j = np.array([(loop.i, loop.j) for loop in others]).T
@@ -109,7 +121,7 @@ class RelativeUncertainty:
         # j -> i -> i' -> j' -> j
         cycle = se3.inverse(one.T_i_j) @ (se3.inverse(own[one.i]) @ own[i]) @ T @ (se3.inverse(own[j]) @ own[one.j])
         spread = self._apart(i, np.full(len(i), one.i)) + self._apart(j, np.full(len(j), one.j))
-        spread = spread + self._moved(one.j, one) + np.array([self._moved(loop.j, loop) for loop in others])
+        spread = spread + noise + their_noise
         to_j = se3.adjoint(se3.inverse(own[one.j]))
         error = se3.log(se3.rigid(cycle))
         whitened = np.linalg.solve(to_j @ spread @ to_j.T, error[:, :, None])[:, :, 0]

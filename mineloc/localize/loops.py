@@ -163,7 +163,7 @@ class LoopCloser:
     def keep_consistent(self) -> list[RelativePose]:
         """Drop the closures that contradict others by odometry, the one with most contradictions first; what stays."""
         kept = list(self.loops)
-        agree = np.array([self._uncertainty.consistent(loop, kept) for loop in kept]).reshape(len(kept), len(kept))
+        agree = self._uncertainty.agreement(kept)
         left = np.ones(len(kept), np.bool_)
         while left.any():
             contradicted = (~(agree & agree.T) & left).sum(axis=1) * left

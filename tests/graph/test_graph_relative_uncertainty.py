@@ -83,6 +83,10 @@ def test_cycles_that_come_back_agree_and_others_do_not() -> None:
 
     agree = known.consistent(loop(5, 100, 0.0), [loop(9, 96, 0.0), loop(9, 96, 0.05), loop(9, 96, 3.0)])
     assert agree.tolist() == [True, True, False]
+    loops = [loop(5, 100, 0.0), loop(9, 96, 0.0), loop(9, 96, 0.05), loop(9, 96, 3.0)]
+    expected = [known.consistent(one, loops).tolist() for one in loops]
+    assert known.agreement(loops).tolist() == expected
+    assert known.agreement([]).shape == (0, 0)
     # two closures with the same error agree with one another: only others can tell
     assert known.consistent(loop(5, 100, 3.0), [loop(9, 99, 3.0)]).tolist() == [True]
 
