@@ -12,9 +12,9 @@ from mineloc.config import SimulateConfig
 from mineloc.data import Calibration, DepthImage, FlightInfo, ImuSamples, Sweep, Trajectory
 from mineloc.errors import SimulationError
 from mineloc.roadways.graph import RoadwayGraph
-from mineloc.sim.camera_mount import camera_model, camera_mounting
-from mineloc.sim.depth_camera import DepthCamera, DepthErrors, DepthView
+from mineloc.sim.camera_mount import camera_mounting
 from mineloc.sim.drone import drone_motion
+from mineloc.sim.flown_camera import FlownCamera
 from mineloc.sim.imu import Imu, ImuNoise, mounting
 from mineloc.sim.lidar import LidarModel, lidar_model
 from mineloc.sim.machine import Machine, in_front
@@ -37,9 +37,6 @@ AFTER_NS = 20_000_000
 
 # what a random stream is for
 _TOUR, _SWAY, _VIBRATION, _IMU, _RANGES, _LOSS = range(1, 7)
-_DEPTH, _DEPTH_BIAS = 24, 25
-# the camera runs on its own: its images are not taken when a sweep begins
-_SHUTTER_NS = 13_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,7 +100,7 @@ class SimulatedFlight:
             rng=_rng(config.seed, _SWAY),
         )
         self.machine = Machine(self.motion, scene) if config.machine else None
-        self._camera = _depth_camera(scene, config) if config.camera else None
+        self.camera = self._carry_camera() if config.camera else None
         self.sweeps = int(self.motion.end_s * config.lidar_hz) - 1
         self.lost = missing(self.sweeps, config.sweep_loss, _rng(config.seed, _LOSS))
         self.info = FlightInfo(
@@ -120,6 +117,16 @@ class SimulatedFlight:
     def pose(self, stamps_ns: I64) -> F64:
         """(n, 4, 4) true `T_map_body` at any times of the flight."""
         return self.motion.pose((stamps_ns - START_NS).astype(np.float64) * 1e-9)
+
+    def _carry_camera(self) -> FlownCamera:
+        T_body_camera = camera_mounting()
+        return FlownCamera(
+            self.mine.scene,
+            self.config,
+            lambda stamps_ns: self.pose(stamps_ns) @ T_body_camera,
+            start_ns=START_NS,
+            machine=self.machine,
+        )
 
     def packets(self) -> Iterator[Packet]:
         """The flight, one revolution after the other; the same every time it is asked for."""
@@ -142,7 +149,7 @@ class SimulatedFlight:
                 None if self.lost[revolution] else self.sweep(revolution),
                 imu.until(START_NS + end_ns),
                 Trajectory(stamps, self.pose(stamps)),
-                self._depth_images(START_NS + begin_ns, START_NS + end_ns),
+                () if self.camera is None else tuple(self.camera.between(START_NS + begin_ns, START_NS + end_ns)),
             )
 
     def sweep(self, revolution: int) -> Sweep:
@@ -168,10 +175,7 @@ class SimulatedFlight:
         Raises:
             ValueError: the configuration has no camera.
         """
-        camera, view = self._view(stamp_ns)
-        return DepthImage(
-            stamp_ns, np.where(np.isfinite(view.depth_m), view.depth_m, 0.0).astype(np.float32), camera.camera
-        )
+        return self._need_camera().truth(stamp_ns)
 
     def depth_image(self, index: int) -> DepthImage:
         """One measured depth image, counted from 0.
@@ -179,42 +183,12 @@ class SimulatedFlight:
         Raises:
             ValueError: the configuration has no camera.
         """
-        stamp_ns = self._exposure_ns(index)
-        camera, view = self._view(stamp_ns)
-        return DepthImage(stamp_ns, camera.measure(view, _rng(self.config.seed, _DEPTH, index)), camera.camera)
+        return self._need_camera().image(index)
 
-    def _exposure_ns(self, index: int) -> int:
-        return START_NS + _SHUTTER_NS + round(index * 1e9 / self.config.camera_hz)
-
-    def _view(self, stamp_ns: int) -> tuple[DepthCamera, DepthView]:
-        if self._camera is None or self.calibration.T_body_camera is None:
+    def _need_camera(self) -> FlownCamera:
+        if self.camera is None:
             raise ValueError("this flight has no depth camera: simulate.camera")
-        T_map_camera = self.pose(np.array([stamp_ns]))[0] @ self.calibration.T_body_camera
-        box = self.machine.pose((stamp_ns - START_NS) * 1e-9) if self.machine else None
-        return self._camera, self._camera.look(T_map_camera, box)
-
-    def _depth_images(self, begin_ns: int, end_ns: int) -> tuple[DepthImage, ...]:
-        """Those taken in `[begin_ns, end_ns)`."""
-        if self._camera is None:
-            return ()
-        first = max(0, int((begin_ns - START_NS - _SHUTTER_NS) * 1e-9 * self.config.camera_hz) - 1)
-        out: list[DepthImage] = []
-        while (stamp_ns := self._exposure_ns(first)) < end_ns:
-            if stamp_ns >= begin_ns:
-                out.append(self.depth_image(first))
-            first += 1
-        return tuple(out)
-
-
-def _depth_camera(scene: Scene, config: SimulateConfig) -> DepthCamera:
-    errors = DepthErrors(
-        config.depth_subpixel_px,
-        config.depth_correlated_px,
-        config.depth_bias_px,
-        config.depth_range_m,
-        config.depth_holes,
-    )
-    return DepthCamera(scene, camera_model(config.camera_size), errors, _rng(config.seed, _DEPTH_BIAS))
+        return self.camera
 
 
 def _as_sweep(shots: Shots, returns: Returns, start_ns: int, period_ns: int) -> Sweep:
