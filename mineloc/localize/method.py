@@ -13,6 +13,7 @@ from mineloc.localize.graph_method import GraphMethod
 from mineloc.localize.localization import FlightData, Localization
 from mineloc.localize.loops import LoopCloser
 from mineloc.odometry.front_end import FrontEnd
+from mineloc.odometry.link3d_front_end import Link3dFrontEnd
 from mineloc.odometry.loam import LoamFrontEnd
 from mineloc.odometry.mineloc_front_end import MinelocFrontEnd
 from mineloc.progress import Progress, quiet
@@ -25,6 +26,11 @@ def _mineloc(config: Config, calibration: Calibration) -> FrontEnd:
 def _loam(config: Config, calibration: Calibration) -> FrontEnd:
     del calibration  # LOAM uses no IMU
     return LoamFrontEnd(config.loam, config.keyframe)
+
+
+def _link3d(config: Config, calibration: Calibration) -> FrontEnd:
+    del calibration  # nor does LinK3D
+    return Link3dFrontEnd(config.link3d, config.loam, config.keyframe)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +72,10 @@ METHODS: dict[str, Method] = {
     ),
     "loam": Method("loam", _loam, "LOAM as published, the baseline of both papers"),
     "loam_scan_context": Method("loam", _loam, "LOAM with Scan Context loop closures", frozenset({"place"})),
+    "link3d": Method("link3d", _link3d, "LOAM whose edges LinK3D gathers (paper B), no loop closures"),
+    "link3d_scan_context": Method(
+        "link3d", _link3d, "paper B: LinK3D and Scan Context loop closures", frozenset({"place"})
+    ),
 }
 
 

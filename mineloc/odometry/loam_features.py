@@ -218,6 +218,21 @@ def _reject_unreliable(points: F32, i: int, picked: NDArray[np.bool_]) -> None:
 
 
 @njit(cache=True, nogil=True)
+def unreliable_points(points: F32, starts: I64) -> NDArray[np.bool_]:
+    """What LOAM distrusts as edges: occluded points, surfaces parallel to the beam; (n,), False at the ends of rings.
+
+    Args:
+        points: (n, 3) sorted by ring, in the order of firing within a ring.
+        starts: (r + 1,) from `ring_starts`.
+    """
+    out = np.zeros(points.shape[0], np.bool_)
+    for ring in range(starts.shape[0] - 1):
+        for i in range(starts[ring] + REGION, starts[ring + 1] - REGION - 1):
+            _reject_unreliable(points, i, out)
+    return out
+
+
+@njit(cache=True, nogil=True)
 def _suppress_neighbours(points: F32, i: int, gap_m2: float, picked: NDArray[np.bool_]) -> None:
     for step in (1, -1):
         for k in range(1, REGION + 1):
