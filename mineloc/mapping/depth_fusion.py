@@ -22,6 +22,7 @@ from scipy.spatial import KDTree
 from mineloc.config import FusionConfig
 from mineloc.data import F32, F64, I64, CameraModel, DepthImage
 from mineloc.data.checks import freeze, need
+from mineloc.mapping.depth_holes import fill_from_lidar
 from mineloc.mapping.depth_projection import Samples, project
 from mineloc.mapping.depth_smoothing import smooth_inverse_depth
 from mineloc.mapping.kriging import fit_drift, krige_near
@@ -30,7 +31,6 @@ from mineloc.mapping.variogram import BinnedLags, bin_lags, fit_exponential
 _VARIOGRAM_SAMPLES = 400
 _CLEAN_SHARE = 0.1  # smoothing of a pixel well inside a surface leaves less of the white variance
 _FORGOTTEN = 0.05  # of the first prior that comes back to the drift with every image
-_HOLE_NEIGHBOURS = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,14 +99,14 @@ class DepthFusion:
         need(depth.camera == self.camera, "an image of another camera")
         smooth, left = self._smoothed(depth)
         lidar = project(points_lidar, T_camera_lidar, self.camera)
-        seen, error = self._errors(smooth, left, lidar)
+        seen, error, open_to_both = self._errors(smooth, left, lidar)
         self._learn(seen, error)
         error_of, variance_of = self._kriged(smooth, seen, error)
         inverse = np.where(smooth > 0, smooth - error_of, 0.0)
         # what the window inside a surface leaves of the noise is in n; beside edges and holes it leaves more
         within = 1.0 / (2 * self._config.window_px + 1) ** 2
         variance = variance_of + np.maximum(left - within, 0.0) * self._white**2
-        self._fill(inverse, variance, lidar)
+        self._fill(inverse, variance, open_to_both)
         return self._fused(depth.stamp_ns, inverse, variance)
 
     @property
@@ -120,16 +120,18 @@ class DepthFusion:
             inverse, sigma=self._white, half_px=c.window_px, edge_sigmas=c.edge_sigmas, edge_slope=c.edge_slope
         )
 
-    def _errors(self, smooth: F32, left: F32, lidar: Samples) -> tuple[Samples, F64]:
-        """n at the LiDAR's pixels that lie well inside a surface both sensors see."""
+    def _errors(self, smooth: F32, left: F32, lidar: Samples) -> tuple[Samples, F64, Samples]:
+        """n at the LiDAR's pixels well inside a surface that both sensors see; and all points but the contradicted.
+
+        The LiDAR looks past edges that hide what is behind from the camera.
+        """
         at = smooth[lidar.row, lidar.column]
-        clean = (at > 0) & (left[lidar.row, lidar.column] < _CLEAN_SHARE)
-        seen = lidar.keep(clean)
-        error = at[clean] - seen.inverse_depth
-        drift = self._mean[0] + seen.places_px @ self._mean[1:]
-        spread = self._sill + self._noise(seen) + self._prior[0, 0]
-        believed = np.abs(error - drift) < self._config.edge_sigmas * np.sqrt(spread)
-        return seen.keep(believed), np.asarray(error[believed], dtype=np.float64)
+        error = np.asarray(at - lidar.inverse_depth, dtype=np.float64)
+        drift = self._mean[0] + lidar.places_px @ self._mean[1:]
+        spread = self._sill + self._noise(lidar) + self._prior[0, 0]
+        agrees = np.abs(error - drift) < self._config.edge_sigmas * np.sqrt(spread)
+        clean = (at > 0) & (left[lidar.row, lidar.column] < _CLEAN_SHARE) & agrees
+        return lidar.keep(clean), error[clean], lidar.keep(agrees | (at <= 0))
 
     def _noise(self, samples: Samples) -> F64:
         """(n,) variance of the LiDAR's inverse depth, and of the relief that only it sees."""
@@ -193,38 +195,12 @@ class DepthFusion:
         return np.ascontiguousarray(np.take_along_axis(index, order, axis=1))
 
     def _fill(self, inverse: F64, variance: F64, lidar: Samples) -> None:
-        """Where the camera saw nothing: the LiDAR's own inverse depth, kriged with a free drift, from near by."""
-        c = self._config
+        """Where the camera saw nothing: the LiDAR's own inverse depth, where it lies all around on one surface."""
         row, column = np.nonzero(inverse <= 0)
-        if len(lidar) < DRIFT_NEEDS or not len(row):
-            return
         at = np.column_stack([column - self.camera.cx_px, row - self.camera.cy_px]).astype(np.float64)
-        gap, index = KDTree(lidar.places_px).query(at, k=min(_HOLE_NEIGHBOURS, len(lidar)))
-        gap, index = gap.reshape(len(at), -1), np.asarray(index, dtype=np.int64).reshape(len(at), -1)
-        around = lidar.inverse_depth[index]
-        middle = np.median(around, axis=1)
-        whole = np.ptp(around, axis=1) < c.edge_slope * middle * 2.0 * c.gap_px
-        some = (gap[:, -1] < c.gap_px) & whole
-        if not some.any():
-            return
-        # the surface may leave its plane by so much within the gap
-        bent = 0.25 * c.edge_slope * float(np.median(middle[some]))
-        free = np.diag([1e2, 1.0, 1.0])
-        value, spread = krige_near(
-            lidar.places_px,
-            lidar.inverse_depth,
-            self._noise(lidar),
-            at[some],
-            np.ascontiguousarray(index[some]),
-            sill=bent**2,
-            range_=c.gap_px,
-            mean=np.zeros(3),
-            prior=free,
-        )
-        # no farther than what it lies between: a plane drawn on runs away
-        inside = (value >= around[some].min(axis=1)) & (value <= around[some].max(axis=1))
-        inverse[row[some][inside], column[some][inside]] = value[inside]
-        variance[row[some][inside], column[some][inside]] = spread[inside]
+        filled = fill_from_lidar(at, lidar, self._noise(lidar), self._config)
+        inverse[row[filled.chosen], column[filled.chosen]] = filled.inverse_depth
+        variance[row[filled.chosen], column[filled.chosen]] = filled.variance
 
     def _fused(self, stamp_ns: int, inverse: F64, variance: F64) -> FusedDepth:
         known = inverse > 1e-3
@@ -232,10 +208,6 @@ class DepthFusion:
         relief = self._config.relief_m
         sigma = np.where(known, np.sqrt(variance * depth**4 + relief**2), np.inf)
         return FusedDepth(stamp_ns, depth.astype(np.float32), sigma.astype(np.float32), self.camera)
-
-
-DRIFT_NEEDS = 4
-"""Samples for a plane and one to check it."""
 
 
 def _lattice(camera: CameraModel, stride: int) -> tuple[I64, I64]:

@@ -21,6 +21,7 @@ from mineloc.mapping.submaps import Submap, open3d_cloud
 _LOSS = 1e-6
 _ROUNDS = 20
 _DIGITS = 9
+_THINNED = 3  # all but the last ICP only come near
 _SEEN_BY_BOTH = 0.8
 
 
@@ -57,12 +58,14 @@ def register_submaps(
         kernel_m: of Tukey's kernel.
     """
     pipeline: Any = o3d.pipelines.registration
-    a, b = open3d_cloud(source), open3d_cloud(target)
+    target_cloud = open3d_cloud(target)
     T = T_target_source
     for distance_m in distances_m:
+        is_last = distance_m == distances_m[-1]
+        moving = source if is_last else source.thinned(_THINNED)
         found = pipeline.registration_icp(
-            a,
-            b,
+            open3d_cloud(moving, normals=False),
+            target_cloud,
             distance_m,
             T,
             pipeline.TransformationEstimationPointToPlane(pipeline.TukeyLoss(max(kernel_m, distance_m / 3.0))),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,26 +18,35 @@ from mineloc.sweep.voxel_grid import voxel_centroids
 _NEIGHBOURS = 20
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Submap:
     """A piece of the map around one keyframe, its root, in the lidar frame of the root.
 
     Attributes:
         points_root: (n, 3) float64, one mean point a voxel, within `reach_m` of the root.
-        normals_root: (n, 3) unit normals towards the root: FPFH depends on their sign.
         reach_m: radius.
+        normal_radius_m: neighbourhood that a normal is fitted to.
     """
 
     points_root: F64
-    normals_root: F64
     reach_m: float
+    normal_radius_m: float
 
     def __post_init__(self) -> None:
-        need(self.points_root.shape == self.normals_root.shape, "a normal for every point")
+        need(self.points_root.ndim == 2 and self.points_root.shape[1] == 3, "points_root must be (n, 3)")
         freeze(self)
 
     def __len__(self) -> int:
         return len(self.points_root)
+
+    @cached_property
+    def normals_root(self) -> F64:
+        """(n, 3) unit normals towards the root (FPFH depends on their sign); fitted when they are asked for."""
+        return normals_of(self.points_root, radius_m=self.normal_radius_m)
+
+    def thinned(self, every: int) -> Submap:
+        """Every so-many-th point: enough to come near."""
+        return Submap(self.points_root[::every], self.reach_m, self.normal_radius_m)
 
 
 def submap_of(
@@ -62,13 +72,14 @@ def submap_of(
     points = np.concatenate([np.zeros((0, 3)), *placed])
     near = points[np.einsum("ni,ni->n", points, points) < reach_m**2]
     thin = voxel_centroids(near.astype(np.float32), voxel_m).astype(np.float64)
-    return Submap(thin, normals_of(thin, radius_m=normal_radius_m), reach_m)
+    return Submap(thin, reach_m, normal_radius_m)
 
 
-def open3d_cloud(submap: Submap) -> Any:
-    """A submap as open3d's PointCloud, with normals."""
+def open3d_cloud(submap: Submap, *, normals: bool = True) -> Any:
+    """A submap as open3d's PointCloud."""
     cloud = o3d.geometry.PointCloud(_vectors(submap.points_root))
-    cloud.normals = _vectors(submap.normals_root)
+    if normals:
+        cloud.normals = _vectors(submap.normals_root)
     return cloud
 
 
