@@ -247,8 +247,11 @@ class LoopCloser:
                 starts.insert(len(starts) - 1, candidate.T_i_j)
         best: SubmapRegistration | None = None
         which = 0
+        # a good prediction needs no wide search
+        wide = 0 if expected.sigma_m > 0.25 * c.icp_distances_m[0] else min(1, len(c.icp_distances_m) - 1)
         for k, start in enumerate(starts):
-            found = register_submaps(source, target, start, distances_m=c.icp_distances_m, kernel_m=c.icp_kernel_m)
+            distances_m = c.icp_distances_m[wide:]
+            found = register_submaps(source, target, start, distances_m=distances_m, kernel_m=c.icp_kernel_m)
             if best is None or found.overlap > best.overlap:
                 best, which = found, k
             if best.overlap >= c.min_overlap and best.residual_m <= c.max_residual_m:
