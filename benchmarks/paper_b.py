@@ -66,7 +66,8 @@ def main() -> None:
     lines = [
         "`python benchmarks/paper_b.py`: VLP-16 with motion distortion, no IMU used; APE in metres, se3-aligned.",
         "",
-        "| flight | method | max | min | mean | rmse | std | rmse against loam | loops | false | fallback % | coverage % |",
+        "| flight | method | max | min | mean | rmse | std | rmse against loam "
+        "| loops | false | fallback % | coverage % |",
         "| --- | --- " + "| ---: " * 10 + "|",
     ]
     for mine, (length_m, seed) in FLIGHTS.items():
