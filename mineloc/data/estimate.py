@@ -18,15 +18,18 @@ class Degeneracy:
     Attributes:
         score: smallest over largest eigenvalue of the translation block an inlier, in [0, 1].
         weak_directions: (k, 3) unit vectors in the lidar frame along which translation is weakly observed; k may be 0.
+        blurred_directions: (k, 3) the same where a shift hardly changes how well the points fit: what holds them there
+            is no larger than the noise, and the way flown may be too long or too short.
     """
 
     score: float
     weak_directions: F64
+    blurred_directions: F64 = field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
     def is_degenerate(self) -> bool:
-        """Whether any direction is weak."""
-        return len(self.weak_directions) > 0
+        """Whether any direction is weak or blurred."""
+        return len(self.weak_directions) + len(self.blurred_directions) > 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,6 +23,7 @@ class EdgeNoise:
             as n / correlation.
         floor_rad, floor_m: added to every edge: errors that do not average out however many points there are.
         weak_m: added along weak directions: what looks like information there is mostly noise of the normals.
+        blurred_m: added along blurred directions.
         prior_rad, prior_m: what is known of an edge without any registration.
         coast_radps, coast_mps: added for every second that rests on the motion prior alone.
     """
@@ -32,6 +33,7 @@ class EdgeNoise:
     floor_rad: float = 0.0005
     floor_m: float = 0.005
     weak_m: float = 1.0
+    blurred_m: float = 0.1
     prior_rad: float = 0.3
     prior_m: float = 1.0
     coast_radps: float = 0.2
@@ -54,6 +56,11 @@ def degeneracy_of(hessian: F64, matches: int, *, weak_ratio: float = WEAK_RATIO)
         return Degeneracy(0.0, np.eye(3))
     ratios = np.clip(values / largest, 0.0, 1.0)
     return Degeneracy(float(ratios[0]), vectors.T[ratios < weak_ratio])
+
+
+def weakest_direction(hessian: F64) -> F64:
+    """(3,) unit vector in the lidar frame of the least translation information; arguments as for `degeneracy_of`."""
+    return np.linalg.eigh(_translation_block(hessian))[1][:, 0]
 
 
 def edge_information(
@@ -81,6 +88,8 @@ def edge_information(
     inflation[3:, 3:] = np.eye(3) * (noise.floor_m**2 + (noise.coast_mps * coasted_s) ** 2)
     weak = degeneracy.weak_directions
     inflation[3:, 3:] += noise.weak_m**2 * weak.T @ weak
+    blurred = degeneracy.blurred_directions
+    inflation[3:, 3:] += noise.blurred_m**2 * blurred.T @ blurred
     information = np.linalg.solve(np.eye(6) + h @ inflation, h)
     prior = np.diag([1.0 / noise.prior_rad**2] * 3 + [1.0 / noise.prior_m**2] * 3)
     return 0.5 * (information + information.T) + prior

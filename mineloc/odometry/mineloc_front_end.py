@@ -6,7 +6,7 @@ prior inside the solve, gravity through the accelerometer, a robust kernel, and 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,17 +14,19 @@ from mineloc import se3
 from mineloc.config import KeyframeConfig, OdometryConfig
 from mineloc.data import F64, Calibration, Degeneracy, ImuSamples, Keyframe, OdometryStep, RelativePose, Sweep
 from mineloc.errors import FlightError
-from mineloc.odometry.information import EdgeNoise, degeneracy_of, edge_information
+from mineloc.odometry.information import EdgeNoise, degeneracy_of, edge_information, weakest_direction
 from mineloc.odometry.keyframes import KeyframeSelector
 from mineloc.odometry.model_choice import ModelChoice
 from mineloc.odometry.motion import BodyPath, MotionModel
-from mineloc.odometry.registration import Linearised, Thinned, Weighting, linearise
+from mineloc.odometry.registration import Linearised, Thinned, Weighting, contrast, linearise
 from mineloc.odometry.voxel_map import VoxelMap, insert_into_both
 from mineloc.sweep.deskew import transform_between_knots
 from mineloc.sweep.voxel_grid import VoxelMeans, voxel_means
 
 FORGET_EVERY = 100
 _CONVERGED_RAD, _CONVERGED_M = 2e-5, 2e-4
+PROBE_EVERY = 5
+"""Sweeps; what a shift of one of them says goes for the next ones too."""
 LOST_SWEEPS = 10
 """After so many sweeps that the map does not hold, the motion model begins anew."""
 
@@ -33,7 +35,11 @@ LOST_SWEEPS = 10
 class _Registered:
     last: Linearised | None
     hessian_lidar: F64
-    points: int
+    cloud: Thinned
+
+    @property
+    def points(self) -> int:
+        return len(self.cloud.ranges)
 
     @property
     def matches(self) -> int:
@@ -70,6 +76,7 @@ class MinelocFrontEnd:
         self._flown_m = 0.0
         self._coasted_s = 0.0
         self._lost_sweeps = 0
+        self._is_blurred, self._until_probe = False, 0
 
     def step(self, sweep: Sweep, imu: ImuSamples) -> OdometryStep:
         """Deskew by the predicted motion, register to the patches inside the motion prior, grow the map.
@@ -87,10 +94,11 @@ class MinelocFrontEnd:
         self._coasted_s += (motion.stamp_ns - before[0]) * 1e-9 if reason else 0.0
         self._lost_sweeps = self._lost_sweeps + 1 if reason and registered.points else 0
         self._flown_m += float(np.linalg.norm(motion.T_odom_body[:3, 3] - before[1][:3, 3]))
+        degeneracy = self._judged(registered, motion)
         if self._choice.follow(imu):
             self._maps = self._new_maps()
         self._grow_map(cloud)
-        return self._told(motion.stamp_ns, cloud, registered, reason)
+        return self._told(motion.stamp_ns, cloud, registered, degeneracy, reason)
 
     def _model(self, sweep: Sweep, imu: ImuSamples) -> MotionModel:
         """The motion model for a sweep; with a new one the map begins anew too."""
@@ -129,9 +137,8 @@ class MinelocFrontEnd:
         """Gauss-Newton on prior and residuals together; without a map or points the prediction stands."""
         few = voxel_means(*cloud, self._config.sweep_voxel_m)
         thinned = Thinned(se3.apply(self._choice.T_body_lidar, few.points), few.times_s, few.weights)
-        count = len(thinned.ranges)
-        if not len(self._maps[0]) or not count:
-            return _Registered(None, np.zeros((6, 6)), count)
+        if not len(self._maps[0]) or not len(thinned.ranges):
+            return _Registered(None, np.zeros((6, 6)), thinned)
         predicted, A = motion.covariance, motion.measured
         prior = np.asarray(np.linalg.inv(predicted), dtype=np.float64)
         share, rounds = self._config.information_share, self._config.rounds
@@ -151,7 +158,7 @@ class MinelocFrontEnd:
         motion.covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
         twist_prior = np.linalg.inv(A[6:] @ predicted @ A[6:].T) / share
         still = H[:6, :6] - H[:6, 6:] @ np.linalg.solve(H[6:, 6:] + twist_prior, H[6:, :6])
-        return _Registered(last, self._in_lidar(still, motion.T_odom_body), count)
+        return _Registered(last, self._in_lidar(still, motion.T_odom_body), thinned)
 
     def _in_lidar(self, H: F64, T_odom_body: F64) -> F64:
         """The Hessian of [rotation (body), position (odom)] as one of a right perturbation of the lidar pose."""
@@ -159,6 +166,24 @@ class MinelocFrontEnd:
         to_body[3:, 3:] = T_odom_body[:3, :3]
         A = to_body @ se3.adjoint(self._choice.T_body_lidar)
         return A.T @ H @ A
+
+    def _judged(self, registered: _Registered, motion: MotionModel) -> Degeneracy | None:
+        """What the information says of the pose, and every few sweeps a shift along its weakest direction."""
+        if registered.last is None:
+            return None
+        c, hessian = self._config, registered.hessian_lidar
+        found = degeneracy_of(hessian, registered.matches, weak_ratio=c.weak_ratio)
+        if found.score >= c.probe_below or len(found.weak_directions):
+            self._is_blurred, self._until_probe = False, 0
+            return found
+        direction_lidar = weakest_direction(hessian)
+        if self._until_probe == 0:
+            shift = motion.T_odom_body[:3, :3] @ self._choice.T_body_lidar[:3, :3] @ direction_lidar * c.probe_m
+            pose, twist = motion.T_odom_body, _twist(motion)
+            growth = contrast(registered.cloud, pose, twist, self._maps, self._weighting, shift)
+            self._is_blurred, self._until_probe = growth < c.min_contrast, PROBE_EVERY
+        self._until_probe -= 1
+        return replace(found, blurred_directions=direction_lidar[None]) if self._is_blurred else found
 
     def _doubt(self, registered: _Registered) -> str:
         """Why a pose rests on the motion prior alone; empty if it does not."""
@@ -182,12 +207,11 @@ class MinelocFrontEnd:
             for patches in self._maps:
                 patches.forget(self._flown_m - self._config.forget_after_m)
 
-    def _told(self, stamp_ns: int, cloud: VoxelMeans, registered: _Registered, reason: str) -> OdometryStep:
+    def _told(
+        self, stamp_ns: int, cloud: VoxelMeans, registered: _Registered, degeneracy: Degeneracy | None, reason: str
+    ) -> OdometryStep:
         T_odom_lidar = self._choice.T_told_lidar
         last = registered.last
-        degeneracy = None
-        if last is not None:
-            degeneracy = degeneracy_of(registered.hessian_lidar, registered.matches, weak_ratio=self._config.weak_ratio)
         keyframe, edge = None, None
         if len(cloud.points) and self._selector.consider(stamp_ns, T_odom_lidar):
             points = voxel_means(*cloud, self._keyframe_config.voxel_m).points.astype(np.float32)

@@ -163,6 +163,31 @@ def linearise(
     return Linearised(planes, points, planar, int(tally[_OTHER]), int(tally[_REJECTED]), rms)
 
 
+def contrast(
+    sweep: Thinned, T_odom_body: F64, twist: F64, maps: tuple[VoxelMap, VoxelMap], w: Weighting, shift_m: F64
+) -> float:
+    """By what share a shift of the pose makes the points' mean squared distance from the planes grow.
+
+    A Hessian takes noise for structure: the normals of patches along a smooth roadway tilt at random, and that looks
+    like information. Points that find their patches anew show whether the shift is really seen.
+
+    Args:
+        sweep, T_odom_body, twist, maps, w: as for `linearise`, at the registered pose.
+        shift_m: (3,) in odom; tried forwards and backwards.
+
+    Returns:
+        Zero where the points fit as well elsewhere, one where the shift weighs as much as all noise; infinite without
+        a residual.
+    """
+    squares = []
+    for sign in (0.0, 1.0, -1.0):
+        T = T_odom_body.copy()
+        T[:3, 3] += sign * shift_m
+        squares.append(linearise(sweep, T, twist, maps, w).residual_m ** 2)
+    here, there = squares[0], 0.5 * (squares[1] + squares[2])
+    return there / here - 1.0 if here > 0.0 and np.isfinite(there) else float("inf")
+
+
 def _whole(upper: F64) -> F64:
     """(12, 12) from the three (6, 6) sums, of which the upper triangles are there."""
     place, mixed, motion = upper + np.swapaxes(np.triu(upper, 1), 1, 2)

@@ -131,7 +131,7 @@ def _sweeps(found: Localization) -> pl.DataFrame:
 def _weakest(step: OdometryStep) -> F64:
     if step.degeneracy is None or not step.degeneracy.is_degenerate:
         return np.full(3, np.nan)
-    return step.degeneracy.weak_directions[0]
+    return np.concatenate([step.degeneracy.weak_directions, step.degeneracy.blurred_directions])[0]
 
 
 def _keyframes(found: Localization) -> pl.DataFrame:

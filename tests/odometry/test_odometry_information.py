@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mineloc import se3
-from mineloc.data import F64
+from mineloc.data import F64, Degeneracy
 from mineloc.odometry.information import EdgeNoise, degeneracy_of, edge_information
 
 
@@ -107,3 +107,13 @@ def test_without_inflation_it_is_paper_a_made_right() -> None:
     h = walls(3, 300, ends=True)
     exact = EdgeNoise(0.03, correlation=1, floor_rad=0, floor_m=0, weak_m=0, prior_rad=1e9, prior_m=1e9)
     assert np.allclose(edge_information(h, degeneracy_of(h, 300), noise=exact), h / (2 * 0.03**2))
+
+
+def test_an_edge_is_no_surer_along_a_blurred_direction_than_the_probe() -> None:
+    h = walls(0, 500, ends=True)
+    clear = degeneracy_of(h, 500)
+    blurred = Degeneracy(clear.score, clear.weak_directions, np.array([[1.0, 0.0, 0.0]]))
+    assert blurred.is_degenerate and not clear.is_degenerate
+    sigma = [np.sqrt(np.diag(np.linalg.inv(edge_information(h, one)))[3:]) for one in (clear, blurred)]
+    assert sigma[1][0] == pytest.approx(np.hypot(sigma[0][0], 0.1), rel=0.02)
+    assert sigma[1][1:] == pytest.approx(sigma[0][1:], rel=0.02)

@@ -12,7 +12,7 @@ from mineloc import se3
 from mineloc.config import OdometryConfig
 from mineloc.data import F64
 from mineloc.odometry.motion import add_to_pose
-from mineloc.odometry.registration import Linearised, Thinned, Weighting, linearise, linearise_plainly
+from mineloc.odometry.registration import Linearised, Thinned, Weighting, contrast, linearise, linearise_plainly
 from mineloc.odometry.voxel_map import VoxelMap
 
 DEFAULT = Weighting.of(OdometryConfig())
@@ -243,3 +243,33 @@ def test_one_ring_on_a_wall_is_no_plane() -> None:
     out = linearise(few, np.eye(4), STILL, (fine, coarse), DEFAULT._replace(min_cosine=0.0))
     assert out.planar == 0
     assert out.other > 0
+
+
+def roadway(rng: np.random.Generator, n: int, steps_m: float) -> F64:
+    """Points on floor, roof and walls of 40 x 5 x 4 m whose walls jump in and out every 3 m by `steps_m`, faces too."""
+    points = rng.uniform([-20, -1, -1], [20, 1, 1], (n, 3)) * [1, 2.5, 2]
+    wall, side = rng.integers(1, 3, n), rng.choice([-1.0, 1.0], n)
+    into_m = np.where(points[:, 0] % 6.0 < 3.0, steps_m, 0.0)
+    faces = rng.uniform(size=n) < (0.1 if steps_m else 0.0)
+    points[faces, 0] = np.round(points[faces, 0] / 3.0) * 3.0
+    into_m[faces] = rng.uniform(0, steps_m, int(faces.sum()))
+    points[np.arange(n), wall] = side * (np.array([20.0, 2.5, 2.0])[wall] - into_m)
+    return points + rng.normal(0, 0.015, (n, 3))
+
+
+@pytest.mark.parametrize("steps_m", [0.0, 1.0], ids=["smooth", "stepped"])
+def test_a_shift_along_a_roadway_is_seen_where_its_walls_have_faces(steps_m: float) -> None:
+    rng = np.random.default_rng(0)
+    maps = VoxelMap(0.3, min_weight=5.0, growth=0.0), VoxelMap(0.9, min_weight=5.0, growth=0.0)
+    for patches in maps:
+        patches.insert(roadway(rng, 100_000, steps_m), now=0.0)
+    sweep = Thinned(roadway(rng, 3000, steps_m), np.zeros(3000), np.ones(3000))
+    along, across = (contrast(sweep, np.eye(4), STILL, maps, DEFAULT, 0.1 * axis) for axis in np.eye(3)[:2])
+    assert along > 0.5 if steps_m else abs(along) < 0.05
+    assert across > 2.0
+
+
+def test_contrast_is_infinite_where_nothing_fits() -> None:
+    maps = VoxelMap(0.3), VoxelMap(0.9)
+    sweep = Thinned(np.ones((5, 3)), np.zeros(5), np.ones(5))
+    assert contrast(sweep, np.eye(4), STILL, maps, DEFAULT, np.array([0.1, 0.0, 0.0])) == np.inf
