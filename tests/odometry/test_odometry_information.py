@@ -113,7 +113,8 @@ def test_an_edge_is_no_surer_along_a_blurred_direction_than_the_probe() -> None:
     h = walls(0, 500, ends=True)
     clear = degeneracy_of(h, 500)
     blurred = Degeneracy(clear.score, clear.weak_directions, np.array([[1.0, 0.0, 0.0]]))
-    assert blurred.is_degenerate and not clear.is_degenerate
+    assert blurred.is_degenerate
+    assert not clear.is_degenerate
     sigma = [np.sqrt(np.diag(np.linalg.inv(edge_information(h, one)))[3:]) for one in (clear, blurred)]
     assert sigma[1][0] == pytest.approx(np.hypot(sigma[0][0], 0.1), rel=0.02)
     assert sigma[1][1:] == pytest.approx(sigma[0][1:], rel=0.02)
