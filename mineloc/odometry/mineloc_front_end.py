@@ -20,7 +20,7 @@ from mineloc.odometry.model_choice import ModelChoice
 from mineloc.odometry.motion import BodyPath, MotionModel
 from mineloc.odometry.registration import Linearised, Thinned, Weighting, contrast, linearise
 from mineloc.odometry.voxel_map import VoxelMap, insert_into_both
-from mineloc.sweep.deskew import transform_between_knots
+from mineloc.sweep.deskew import moved_by_twist, transform_between_knots
 from mineloc.sweep.voxel_grid import VoxelMeans, voxel_means
 
 FORGET_EVERY = 100
@@ -130,8 +130,8 @@ class MinelocFrontEnd:
         twist, T_body_lidar = _twist(motion), self._choice.T_body_lidar
         rate, velocity = twist[:3], motion.T_odom_body[:3, :3].T @ twist[3:]
         turn = T_body_lidar[:3, :3].T
-        shift = cloud.points @ se3.hat(turn @ rate).T + turn @ (velocity + np.cross(rate, T_body_lidar[:3, 3]))
-        return cloud._replace(points=cloud.points + cloud.times_s[:, None] * shift)
+        velocity_lidar = turn @ (velocity + np.cross(rate, T_body_lidar[:3, 3]))
+        return cloud._replace(points=moved_by_twist(cloud.points, cloud.times_s, turn @ rate, velocity_lidar))
 
     def _register(self, motion: MotionModel, cloud: VoxelMeans) -> _Registered:
         """Gauss-Newton on prior and residuals together; without a map or points the prediction stands."""
@@ -180,7 +180,8 @@ class MinelocFrontEnd:
         if self._until_probe == 0:
             shift = motion.T_odom_body[:3, :3] @ self._choice.T_body_lidar[:3, :3] @ direction_lidar * c.probe_m
             pose, twist = motion.T_odom_body, _twist(motion)
-            growth = contrast(registered.cloud, pose, twist, self._maps, self._weighting, shift)
+            here_m = registered.last.residual_m
+            growth = contrast(registered.cloud, pose, twist, self._maps, self._weighting, shift, here_m=here_m)
             self._is_blurred, self._until_probe = growth < c.min_contrast, PROBE_EVERY
         self._until_probe -= 1
         return replace(found, blurred_directions=direction_lidar[None]) if self._is_blurred else found

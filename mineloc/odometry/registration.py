@@ -164,7 +164,14 @@ def linearise(
 
 
 def contrast(
-    sweep: Thinned, T_odom_body: F64, twist: F64, maps: tuple[VoxelMap, VoxelMap], w: Weighting, shift_m: F64
+    sweep: Thinned,
+    T_odom_body: F64,
+    twist: F64,
+    maps: tuple[VoxelMap, VoxelMap],
+    w: Weighting,
+    shift_m: F64,
+    *,
+    here_m: float | None = None,
 ) -> float:
     """By what share a shift of the pose makes the points' mean squared distance from the planes grow.
 
@@ -174,18 +181,19 @@ def contrast(
     Args:
         sweep, T_odom_body, twist, maps, w: as for `linearise`, at the registered pose.
         shift_m: (3,) in odom; tried forwards and backwards.
+        here_m: root mean square distance at the pose itself; computed when not given.
 
     Returns:
         Zero where the points fit as well elsewhere, one where the shift weighs as much as all noise; infinite without
         a residual.
     """
-    squares = []
-    for sign in (0.0, 1.0, -1.0):
-        T = T_odom_body.copy()
-        T[:3, 3] += sign * shift_m
-        squares.append(linearise(sweep, T, twist, maps, w).residual_m ** 2)
-    here, there = squares[0], 0.5 * (squares[1] + squares[2])
-    return there / here - 1.0 if here > 0.0 and np.isfinite(there) else float("inf")
+    if here_m is None:
+        here_m = linearise(sweep, T_odom_body, twist, maps, w).residual_m
+    shifted = [np.array(T_odom_body), np.array(T_odom_body)]
+    shifted[0][:3, 3] += shift_m
+    shifted[1][:3, 3] -= shift_m
+    here, there = here_m**2, np.mean([linearise(sweep, T, twist, maps, w).residual_m ** 2 for T in shifted])
+    return float(there / here) - 1.0 if here > 0.0 and np.isfinite(there) else float("inf")
 
 
 def _whole(upper: F64) -> F64:

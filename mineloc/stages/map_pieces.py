@@ -13,11 +13,26 @@ from typing import NamedTuple
 import numpy as np
 
 from mineloc import se3
+from mineloc.compiled import njit
 from mineloc.data import F32, F64, OdometryStep
 from mineloc.sweep.voxel_grid import voxel_centroids
 
 _POINT_BYTES = 12
 _MOST_POINTS = 400_000  # gathered before they are thinned: hovering gives no keyframes
+
+
+@njit(cache=True, nogil=True)
+def _placed(points: F32, T: F64, most_m2: float) -> F32:
+    """The points (n, 3) with a squared range below, taken through T (4, 4)."""
+    out = np.empty((len(points), 3), np.float32)
+    count = 0
+    for i in range(len(points)):
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        if x * x + y * y + z * z < most_m2:
+            for row in range(3):
+                out[count, row] = T[row, 0] * x + T[row, 1] * y + T[row, 2] * z + T[row, 3]
+            count += 1
+    return out[:count]
 
 
 class _Piece(NamedTuple):
@@ -63,8 +78,8 @@ class MapPieces:
 
     def add(self, points: F32, T_odom_points: F64) -> None:
         """Points (n, 3) in any frame, and its place in the odometry frame."""
-        near = points[np.einsum("ni,ni->n", points, points) < self._max_range_m**2]
-        placed = se3.apply(se3.inverse(self._T_odom_key) @ T_odom_points, near).astype(np.float32)
+        T_key_points = np.ascontiguousarray(se3.inverse(self._T_odom_key) @ T_odom_points)
+        placed = _placed(np.ascontiguousarray(points), T_key_points, self._max_range_m**2)
         self._gathered.append(placed)
         self._count += len(placed)
         if self._count > _MOST_POINTS:

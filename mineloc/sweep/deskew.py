@@ -16,11 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mineloc import se3
-from mineloc.compiled import njit
+from mineloc.compiled import njit, prange
 from mineloc.data import F32, F64, I64, Sweep
 
 KNOT_NS = 500_000
 """Longest time between two exact transforms."""
+PARTS = 8
+"""Of a sweep, moved side by side."""
 
 
 def deskew_constant_twist(sweep: Sweep, twist_lidar: NDArray[np.float64], *, target_ns: int) -> Sweep:
@@ -94,7 +96,6 @@ def _move(points: F32, offsets_ns: I64, knots_ns: I64, T_target_knot: F64) -> F3
     return transform_between_knots(points, offsets_ns, knots_ns, np.ascontiguousarray(T_target_knot[:, :3, :]))
 
 
-@njit(cache=True, nogil=True)
 def transform_between_knots(points: F32, offsets_ns: I64, knots_ns: I64, transforms: F64) -> F32:
     """Take every point through the transform of its time, linearly interpolated between knots.
 
@@ -107,7 +108,22 @@ def transform_between_knots(points: F32, offsets_ns: I64, knots_ns: I64, transfo
     Returns:
         (n, 3) float32.
     """
-    out = np.empty((points.shape[0], 3), np.float32)
+    out = np.empty((len(points), 3), np.float32)
+    _transform_in_parts(points, offsets_ns, knots_ns, transforms, out)
+    return out
+
+
+@njit(cache=True, parallel=True)
+def _transform_in_parts(points: F32, offsets_ns: I64, knots_ns: I64, transforms: F64, out: F32) -> None:
+    size = (len(points) + PARTS - 1) // PARTS
+    for part in prange(PARTS):
+        a = min(part * size, len(points))
+        b = min(a + size, len(points))
+        _transform(points[a:b], offsets_ns[a:b], knots_ns, transforms, out[a:b])
+
+
+@njit(cache=True, nogil=True)
+def _transform(points: F32, offsets_ns: I64, knots_ns: I64, transforms: F64, out: F32) -> None:
     last = max(knots_ns.shape[0] - 2, 0)
     k = 0
     for i in range(points.shape[0]):
@@ -127,6 +143,17 @@ def transform_between_knots(points: F32, offsets_ns: I64, knots_ns: I64, transfo
             a = p[0] * x + p[1] * y + p[2] * z + p[3]
             b = q[0] * x + q[1] * y + q[2] * z + q[3]
             out[i, row] = a + u * (b - a)
+
+
+@njit(cache=True, nogil=True)
+def moved_by_twist(points: F64, times_s: F64, rate: F64, velocity: F64) -> F64:
+    """Points (n, 3) moved by t (ω × p + v), t their times (n,) in s: a constant twist, to first order."""
+    out = np.empty_like(points)
+    for i in range(len(points)):
+        t, x, y, z = times_s[i], points[i, 0], points[i, 1], points[i, 2]
+        out[i, 0] = x + t * (rate[1] * z - rate[2] * y + velocity[0])
+        out[i, 1] = y + t * (rate[2] * x - rate[0] * z + velocity[1])
+        out[i, 2] = z + t * (rate[0] * y - rate[1] * x + velocity[2])
     return out
 
 
