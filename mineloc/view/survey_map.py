@@ -85,16 +85,14 @@ def _record_roadways(recorder: RunRecorder, survey: MapFolder) -> None:
 
 
 def _record_loops(recorder: RunRecorder, survey: MapFolder) -> None:
-    """Accepted closures as lines between the two keyframes of one flight."""
+    """Accepted closures as lines between their keyframes, of one flight or of two."""
+    positions = poses_of(survey.keyframes)[:, :3, 3]
+    rows = {key: row for row, key in enumerate(survey.keyframes.select("flight", "index").iter_rows())}
+    accepted = survey.fixes.filter(survey.fixes["trusted"])
     strips: list[F64] = []
-    for flight in survey.trajectories:
-        own = survey.keyframes.filter(survey.keyframes["flight"] == flight)
-        positions = poses_of(own)[:, :3, 3]
-        accepted = survey.fixes.filter((survey.fixes["flight"] == flight) & survey.fixes["trusted"])
-        for keyframe, target in accepted.select("keyframe", "target").iter_rows():
-            other = int(target.removeprefix("keyframe "))
-            if other < len(positions) and keyframe < len(positions):
-                strips.append(positions[[other, keyframe]])
+    for flight, keyframe, target in accepted.select("flight", "keyframe", "target").iter_rows():
+        # the target is counted through all flights, as the table is
+        strips.append(positions[[int(target.removeprefix("keyframe ")), rows[flight, keyframe]]])
     if strips:
         recorder.lines("map/loops", strips, colors=GREEN, width_px=2.0)
 
