@@ -24,6 +24,10 @@ from mineloc.data.estimate import RelativePose as RelativePose
 from mineloc.data.flight import Calibration as Calibration
 from mineloc.data.flight import FlightInfo as FlightInfo
 from mineloc.data.flight import Trajectory as Trajectory
+from mineloc.data.intersections import Intersection as Intersection
+from mineloc.data.intersections import IntersectionDatabase as IntersectionDatabase
+from mineloc.data.intersections import Sight as Sight
+from mineloc.data.intersections import WallContour as WallContour
 from mineloc.data.map_cloud import MapCloud as MapCloud
 from mineloc.data.map_cloud import SurfaceKind as SurfaceKind
 from mineloc.data.sweep import ImuSamples as ImuSamples
