@@ -139,13 +139,19 @@ class LoopCloser:
         """Candidates for one keyframe, examined; all closures that are accepted because of it."""
         accepted: list[RelativePose] = []
         registered = 0
+        closed: set[int] = set()
         for candidate in self._candidates(j):
             if registered == self._loops_config.max_candidates:
                 break
+            # earlier passes of one flight are closed with each other: a second closure says nothing new
+            flight = self._first_of_flight(candidate.i)
+            if flight in closed:
+                continue
             examined = _Examined(candidate, self._examine(candidate))
             self._examined.append(examined)
             registered += examined.judgement.T_i_j is not None
             if examined.judgement.loop is not None:
+                closed.add(flight)
                 accepted += self._supported(examined, examined.judgement.loop)
         for loop in accepted:
             self._uncertainty.close(loop)
@@ -260,9 +266,12 @@ class LoopCloser:
 
     def _submap(self, root: int) -> Submap:
         """Around a keyframe, of its own flight alone: odometry does not lead from one flight to the next."""
-        first = max(start for start in self._starts if start <= root)
+        first = self._first_of_flight(root)
         end = min((start for start in self._starts if start > root), default=len(self))
         return submap_around(self._keyframes[first:end], root - first, self._loops_config)
+
+    def _first_of_flight(self, index: int) -> int:
+        return max(start for start in self._starts if start <= index)
 
     def _supported(self, examined: _Examined, loop: RelativePose) -> list[RelativePose]:
         """Count who agrees with a new closure; all that have enough agreement now and were not accepted before."""
