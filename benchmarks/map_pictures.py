@@ -37,7 +37,7 @@ def top_view(survey: MapFolder, out: Path) -> None:
     nodes = survey.roadways.nodes_m[crossing]
     axes.plot(nodes[:, 0], nodes[:, 1], "o", c="black", ms=4, label=f"{len(nodes)} intersections")
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title="Map from above, without the roof")
-    axes.legend(loc="upper right", markerscale=1.0)
+    axes.legend(loc="upper right", markerscale=8.0)
     axes.grid(alpha=0.3)
     _saved(figure, out)
 
@@ -62,7 +62,7 @@ def cross_section(survey: MapFolder, out: Path, *, thick_m: float = 0.5) -> None
             title=f"roadway of {road.length_m:.0f} m: {width:.2f} m wide, {height:.2f} m high",
         )  # fmt: skip
         axes.grid(alpha=0.3)
-    all_axes.flat[0].legend(loc="center")
+    all_axes.flat[0].legend(loc="center", markerscale=2.0)
     _saved(figure, out)
 
 

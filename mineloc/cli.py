@@ -155,6 +155,7 @@ def localize(
     flight: Annotated[Path, typer.Argument(help="A canonical flight (of ingest or simulate).")],
     method: Annotated[str, typer.Option("--method", help="odometry, odometry_loops, loam, loam_scan_context …")],
     out: Annotated[Path, typer.Option("--out", help="The run folder to write.")],
+    prior_map: Annotated[Path | None, typer.Option("--map", help="A map folder, for map_tracking.")] = None,
     recording: Annotated[bool, typer.Option(help="Also write run.rrd, what `mineloc view` shows.")] = True,
     as_json: JsonOption = False,
     config: ConfigOption = None,
@@ -167,7 +168,7 @@ def localize(
 
     settings = load_config(config, overrides or ())
     with progress_bar("localize") as progress:
-        result = run_stage(flight, out, method=method, config=settings, progress=progress)
+        result = run_stage(flight, out, method=method, prior_map=prior_map, config=settings, progress=progress)
     if recording:
         from mineloc.view.run import record_run
 

@@ -12,6 +12,7 @@ from mineloc.errors import ConfigError
 from mineloc.localize.graph_method import GraphMethod
 from mineloc.localize.localization import FlightData, Localization
 from mineloc.localize.loops import LoopCloser
+from mineloc.localize.map_tracking import MapTracking, Prior
 from mineloc.odometry.front_end import FrontEnd
 from mineloc.odometry.link3d_front_end import Link3dFrontEnd
 from mineloc.odometry.loam import LoamFrontEnd
@@ -42,12 +43,14 @@ class Method:
         make_front_end: from configuration and calibration.
         summary: one line for people.
         loops: where loop closures come from: "place" (Scan Context), "position" (the estimate), both or none.
+        needs_map: it localizes in a prior map.
     """
 
     front_end: str
     make_front_end: Callable[[Config, Calibration], FrontEnd]
     summary: str
     loops: frozenset[Literal["place", "position"]] = frozenset()
+    needs_map: bool = False
 
     def closer(self, config: Config) -> LoopCloser | None:
         """What finds the method's loop closures, None for an open-loop method."""
@@ -55,13 +58,23 @@ class Method:
             return None
         return LoopCloser(config, by_place="place" in self.loops, by_position="position" in self.loops)
 
-    def run(self, flight: FlightData, config: Config, *, progress: Progress = quiet) -> Localization:
+    def run(
+        self, flight: FlightData, config: Config, *, prior: Prior | None = None, progress: Progress = quiet
+    ) -> Localization:
         """Localize a flight.
 
+        Args:
+            prior: the map, for methods that need one.
+
         Raises:
+            ConfigError: the method needs a map.
             FlightError: fewer than two sweeps, no points, time going backwards.
         """
         front_end = self.make_front_end(config, flight.calibration)
+        if self.needs_map:
+            if prior is None:
+                raise ConfigError("--method", "the method needs a map", expected="--map MAP/", todo="name a map folder")
+            return MapTracking(config, front_end, prior).run(flight, progress)
         return GraphMethod(config, front_end, closer=self.closer(config)).run(flight, progress)
 
 
@@ -76,6 +89,7 @@ METHODS: dict[str, Method] = {
     "link3d_scan_context": Method(
         "link3d", _link3d, "paper B: LinK3D and Scan Context loop closures", frozenset({"place"})
     ),
+    "map_tracking": Method("mineloc", _mineloc, "every keyframe registered to a prior map", needs_map=True),
 }
 
 

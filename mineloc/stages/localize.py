@@ -20,12 +20,13 @@ from mineloc.localize.localization import FlightData, Localization
 from mineloc.localize.method import Method, method_named
 from mineloc.output import new_folder
 from mineloc.progress import Progress, quiet
+from mineloc.stages.known_map import KnownMap
 from mineloc.stages.run_folder import write_run_folder
 from mineloc.stages.run_tables import fixes_table, pose_columns, sigmas
 
 POINTS_A_KEYFRAME = 250
 """Enough to draw the mine; the map of a survey comes from `reconstruct`."""
-_SECTIONS = {"sweep", "keyframe", "odometry", "loam", "link3d", "scan_context", "loops", "graph"}
+_SECTIONS = {"sweep", "keyframe", "odometry", "loam", "link3d", "scan_context", "loops", "graph", "prior_map"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,24 +63,41 @@ class LocalizeResult:
 
 
 def localize(
-    flight: Path, out: Path, *, method: str, config: Config | None = None, progress: Progress = quiet
+    flight: Path,
+    out: Path,
+    *,
+    method: str,
+    prior_map: Path | None = None,
+    config: Config | None = None,
+    progress: Progress = quiet,
 ) -> LocalizeResult:
     """Localize a flight and write the run folder (DESIGN.md, "A run folder").
 
+    Args:
+        flight: a canonical flight.
+        out: the run folder.
+        method: by its name.
+        prior_map: a map folder, for methods that need one; poses and reference are then told in its frame.
+        config: all sections.
+        progress: told the sweeps that are done.
+
     Raises:
-        ConfigError: no such method.
+        ConfigError: no such method, a method without its map, a map without a start.
+        FormatError: `prior_map` is not a map folder.
         IngestError: `flight` is not a canonical flight, or damaged.
         FlightError: it holds too little to localize.
         OutputError: `out` exists or cannot be written.
     """
     config = config or Config()
     chosen = method_named(method)
+    known = None if prior_map is None else KnownMap.open(prior_map, config)
     with new_folder(out) as folder, FlightReader(flight) as reader:
 
         def counted(done: float, total: float | None, unit: str) -> None:
             progress(done, reader.sweep_count if total is None else total, unit)
 
-        found = chosen.run(FlightData(reader.steps(), reader.calibration), config, progress=counted)
+        prior = None if known is None else known.prior
+        found = chosen.run(FlightData(reader.steps(), reader.calibration), config, prior=prior, progress=counted)
         T_lidar_body = se3.inverse(reader.calibration.T_body_lidar)
         smoothed = found.smoothed.compose(right=T_lidar_body, child="body")
         counts = _counts(found, reader.sweep_count)
@@ -88,13 +106,16 @@ def localize(
             folder,
             smoothed=smoothed,
             online=found.online.compose(right=T_lidar_body, child="body"),
-            reference=reader.reference(),
+            reference=reader.reference() if known is None else known.reference_of(reader),
             sweeps=_sweeps(found),
             keyframes=_keyframes(found),
             points=_points(found),
             fixes=fixes_table(found.fixes),
             timing=timing,
-            manifest=_manifest(flight, reader, method, chosen, config, counts),
+            manifest={
+                **_manifest(flight, reader, method, chosen, config, counts),
+                "map": None if known is None else known.facts,
+            },
         )
     return LocalizeResult(
         out=out,
