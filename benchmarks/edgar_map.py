@@ -188,9 +188,9 @@ def main() -> None:
         errors = trajectory_errors(survey, truth, chosen.work)
         walls = wall_errors(survey, truth, chosen.mesh, flight)
         lines.append(row(name, result, errors, walls, false_loops(survey, truth, flight)))
-        if chosen.pictures is not None:
-            top_view(survey, chosen.pictures / f"{name}_top_view.png")
-            cross_section(survey, chosen.pictures / f"{name}_cross_section.png")
+        if chosen.pictures is not None and name == "control":
+            top_view(survey, chosen.pictures / "edgar_map_top_view.png")
+            cross_section(survey, chosen.pictures / "edgar_map_cross_section.png")
     flown = (
         f"`python benchmarks/edgar_map.py --length-m {chosen.length_m:g} --seed {chosen.seed} "
         f"--target-every-m {chosen.target_every_m:g}`: {path_m:.0f} m in {duration_s:.0f} s, VLP-16, "
