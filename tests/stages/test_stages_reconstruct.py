@@ -21,6 +21,8 @@ from mineloc.stages.reconstruct import ReconstructResult, reconstruct
 SMALL = layered_config(
     [{"loops": {"submap_keyframes": 3, "submap_reach_m": 12.0}, "map": {"max_range_m": 8.0}}], where="test"
 )
+QUICK = SMALL.model_copy(update={"loops": SMALL.loops.model_copy(update={"max_candidates": 1, "every_m": 8.0})})
+"""Where two flights are joined: every candidate is a search from features."""
 GRID = np.array([512_000.0, 4_398_000.0, 2_300.0])
 
 
@@ -121,7 +123,7 @@ def test_two_flights_of_one_mine_become_one_map(flight, mine, tmp_path):
     """The second begins on the other side, flies the other way, and tells its reference in a frame of its own."""
     line = np.roll(ring(13.0), -len(ring(13.0)) // 3, axis=0)[::-1]
     truth = write_flight(tmp_path / "b.mcap", line[: len(line) * 2 // 3], mine, seed=3, name="b")
-    reconstruct([flight[0], tmp_path / "b.mcap"], tmp_path / "map", config=SMALL)
+    reconstruct([flight[0], tmp_path / "b.mcap"], tmp_path / "map", config=QUICK)
     survey = MapFolder.open(tmp_path / "map")
     both = np.concatenate([survey.trajectories[name].positions_m for name in ("a", "b")])
     true = np.concatenate([flight[1], truth])[:, :3, 3]
@@ -134,7 +136,7 @@ def test_flights_of_two_mines_do_not_become_one_map(flight, tmp_path):
     other = roadway_along(line, rough_m=0.12, rng=np.random.default_rng(9))
     write_flight(tmp_path / "b.mcap", line[: len(line) // 2], other, seed=3, name="b")
     with pytest.raises(FlightError, match="places in common"):
-        reconstruct([flight[0], tmp_path / "b.mcap"], tmp_path / "map", config=SMALL)
+        reconstruct([flight[0], tmp_path / "b.mcap"], tmp_path / "map", config=QUICK)
     assert not (tmp_path / "map").exists()
 
 
