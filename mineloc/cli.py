@@ -151,6 +151,27 @@ def reconstruct(
 
 
 @app.command()
+def database(
+    prior_map: Annotated[Path, typer.Argument(metavar="MAP", help="A map folder (of reconstruct).")],
+    out: Annotated[Path, typer.Option("--out", help="The database to write (.mcap).")],
+    as_json: JsonOption = False,
+    config: ConfigOption = None,
+    overrides: SetOption = None,
+) -> None:
+    """The intersections of a map, found and described. E.g. database map/ --out intersections.mcap."""
+    from mineloc.config import load_config
+    from mineloc.stages.database import database as run_stage
+
+    result = run_stage(prior_map, out, config=load_config(config, overrides or ()))
+    if as_json:
+        sys.stdout.write(json.dumps(result.to_dict(), indent=1) + "\n")
+        return
+    from rich.console import Console
+
+    Console(highlight=False).print(result.summary(), soft_wrap=True, markup=False)
+
+
+@app.command()
 def localize(
     flight: Annotated[Path, typer.Argument(help="A canonical flight (of ingest or simulate).")],
     method: Annotated[str, typer.Option("--method", help="odometry, odometry_loops, loam, loam_scan_context …")],

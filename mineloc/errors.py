@@ -68,6 +68,10 @@ class FlightError(MinelocError):
     """A flight is readable but cannot be processed (one sweep, no points, time going backwards)."""
 
 
+class MapError(MinelocError):
+    """A map is whole but cannot serve as asked (no intersection in it)."""
+
+
 class SimulationError(MinelocError):
     """A mine or tour cannot be simulated as asked."""
 

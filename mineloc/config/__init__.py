@@ -16,6 +16,7 @@ from mineloc.config.estimation import OdometryConfig as OdometryConfig
 from mineloc.config.estimation import SweepConfig as SweepConfig
 from mineloc.config.features import Link3dConfig as Link3dConfig
 from mineloc.config.features import ScanContextConfig as ScanContextConfig
+from mineloc.config.intersections import IntersectionsConfig as IntersectionsConfig
 from mineloc.config.localizing import PriorMapConfig as PriorMapConfig
 from mineloc.config.mapping import ControlConfig as ControlConfig
 from mineloc.config.mapping import FusionConfig as FusionConfig

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from mineloc.config.estimation import GraphConfig, KeyframeConfig, LoamConfig, OdometryConfig, SweepConfig
 from mineloc.config.features import Link3dConfig, ScanContextConfig
+from mineloc.config.intersections import IntersectionsConfig
 from mineloc.config.localizing import PriorMapConfig
 from mineloc.config.mapping import ControlConfig, FusionConfig, LoopsConfig, MapConfig
 from mineloc.config.recordings import IngestConfig, SimulateConfig
@@ -38,6 +39,7 @@ class Config(Section):
     fusion: FusionConfig = FusionConfig()
     control: ControlConfig = ControlConfig()
     map: MapConfig = MapConfig()
+    intersections: IntersectionsConfig = IntersectionsConfig()
     prior_map: PriorMapConfig = PriorMapConfig()
     evaluate: EvaluateConfig = EvaluateConfig()
     report: ReportConfig = ReportConfig()

@@ -16,7 +16,7 @@ from mineloc.config import Config
 from mineloc.stages.stage import Input, Job, Stage
 from mineloc.store.digest import Json
 from mineloc.store.store import Outcome, Store
-from mineloc.survey.registry import EVALUATE, INGEST, LOCALIZE, RECONSTRUCT, RECORD, REPORT, SIMULATE
+from mineloc.survey.registry import DATABASE, EVALUATE, INGEST, LOCALIZE, RECONSTRUCT, RECORD, REPORT, SIMULATE
 from mineloc.survey.spec import Flight, Map, Survey
 
 METRICS = "metrics.json"
@@ -143,7 +143,12 @@ def plan_survey(survey: Survey) -> Plan:
             to = f"runs/{flight.name}-{method}"
             steps.extend(_run_steps(flight, method, to))
             runs.append(Run(flight.name, method, survey.out / to))
-    steps.extend(_map_step(one, survey.config) for one in survey.maps)
+    for one in survey.maps:
+        steps.append(_map_step(one, survey.config))
+        if one.intersections:
+            to = f"maps/{one.name}.intersections.mcap"
+            made: dict[str, Wanted] = {"prior_map": Made(steps[-1].name)}
+            steps.append(Step(f"{one.name} database", "", DATABASE, to, made, survey.config))
     localized = tuple(Made(step.name) for step in steps if step.stage is LOCALIZE)
     title: dict[str, Json] = {"title": survey.title} if survey.title else {}
     steps.append(Step("report", "", REPORT, "report", {"runs": localized}, config=survey.config, arguments=title))

@@ -20,6 +20,7 @@ RECONSTRUCT = Stage(
     ("sweep", "keyframe", "odometry", "loam", "link3d", "scan_context", "loops", "graph", "fusion", "control", "map"),
     volatile=frozenset({"timing.json"}),
 )
+DATABASE = Stage("database", 1, "mineloc.stages.database:database", ("intersections", "map"))
 EVALUATE = Stage("evaluate", 1, "mineloc.survey.score:score", ("evaluate",))
 RECORD = Stage("record", 1, "mineloc.view.run:record_run", ("evaluate", "view"))
 REPORT = Stage("report", 1, "mineloc.report.page:write_report", ("evaluate", "report"), inside="report.html")

@@ -23,6 +23,7 @@ name = "level-4"
 flights = ["north"]
 control = "survey/targets.csv"      # surveyed targets, and where flights saw them; else what the flights bring
 observations = "survey/seen.csv"
+intersections = true                # also make the database of its intersections
 """
 
 from __future__ import annotations
@@ -61,6 +62,7 @@ class MapSpec(Section):
     method: str = "odometry_loops"
     control: str | None = None
     observations: str | None = None
+    intersections: bool = Field(default=False, description="also make the database of its intersections")
 
 
 class SurveySpec(Section):
@@ -101,6 +103,7 @@ class Map:
         flights: names of flights of the survey, at least one.
         method: front end and loop closures.
         control, observations: files; None: what the flights bring.
+        intersections: a database of its intersections is made too.
     """
 
     name: str
@@ -108,6 +111,7 @@ class Map:
     method: str
     control: Path | None
     observations: Path | None
+    intersections: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,6 +213,7 @@ def _map(path: Path, spec: MapSpec, flights: list[str]) -> Map:
         method=spec.method,
         control=_existing(path, where, "control", spec.control),
         observations=_existing(path, where, "observations", spec.observations),
+        intersections=spec.intersections,
     )
 
 

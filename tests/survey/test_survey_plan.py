@@ -11,10 +11,10 @@ from mineloc.config import Config, layered_config
 from mineloc.stages.stage import Input, Job
 from mineloc.store.objects import Ref
 from mineloc.survey.plan import Made, plan_survey
-from mineloc.survey.registry import EVALUATE, INGEST, LOCALIZE, RECONSTRUCT, RECORD, REPORT, SIMULATE
+from mineloc.survey.registry import DATABASE, EVALUATE, INGEST, LOCALIZE, RECONSTRUCT, RECORD, REPORT, SIMULATE
 from mineloc.survey.spec import Flight, Map, Survey
 
-STAGES = (SIMULATE, INGEST, RECONSTRUCT, LOCALIZE, EVALUATE, RECORD, REPORT)
+STAGES = (SIMULATE, INGEST, RECONSTRUCT, DATABASE, LOCALIZE, EVALUATE, RECORD, REPORT)
 
 
 def flight(name: str, **what: object) -> Flight:
@@ -56,13 +56,15 @@ def test_what_a_flight_brings_along_is_read_where_it_matters():
 
 
 def test_a_map_is_made_of_its_flights_and_targets():
-    maps = (Map("m", ("b", "a"), "odometry_loops", Path("t.csv"), None),)
+    maps = (Map("m", ("b", "a"), "odometry_loops", Path("t.csv"), None, intersections=True),)
     plan = plan_survey(replace(survey(flight("a"), flight("b")), maps=maps))
     step = plan.step("m reconstruct")
     assert step.needs() == ["b ingest", "a ingest"]
     assert step.inputs["control"] == Path("t.csv")
     assert "observations" not in step.inputs
     assert step.to == "maps/m"
+    assert plan.step("m database").needs() == ["m reconstruct"]
+    assert plan.step("m database").to == "maps/m.intersections.mcap"
     assert plan.steps[-1].needs() == ["a localize odometry", "b localize odometry"]
 
 

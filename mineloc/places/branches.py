@@ -1,0 +1,281 @@
+"""Where roadways meet: branches counted on rings around the widest place, and their meeting point (METHOD 5.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple, cast
+
+import numpy as np
+from scipy.ndimage import binary_opening, distance_transform_edt, label, maximum_filter
+
+from mineloc.config import IntersectionsConfig
+from mineloc.data import F64, I32, Bool
+from mineloc.places.free_grid import FreeGrid
+
+_BEARINGS = 180
+_WIDEST = 3.2
+"""An arc wider than so many clearances is no branch but a hall."""
+_CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.bool_)
+_AGAIN_M = 0.4
+"""The rings are laid around the invariant point once more if it lies so far from the clearance maximum."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Branch:
+    """A roadway that leaves an intersection.
+
+    Attributes:
+        bearing_rad: away from the intersection, counter-clockwise from x, in [0, 2π).
+        point_m: (2,) on its centre line.
+        width_m: mean chord of its arcs.
+    """
+
+    bearing_rad: float
+    point_m: F64
+    width_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Junction:
+    """A place where at least three roadways meet.
+
+    Attributes:
+        point_m: (2,) geometric invariant point, in the grid's frame.
+        covariance_m2: (2, 2) of it, from the spread of the centre lines.
+        clearance_m: distance from the widest place to the nearest wall.
+        branches: by rising bearing.
+    """
+
+    point_m: F64
+    covariance_m2: F64
+    clearance_m: float
+    branches: tuple[Branch, ...]
+
+    @property
+    def branches_rad(self) -> F64:
+        """(b,) rising bearings."""
+        return np.array([branch.bearing_rad for branch in self.branches])
+
+
+class _Arc(NamedTuple):
+    """An open arc of a ring: its middle by bearing and place, its chord, half its angle."""
+
+    bearing_rad: float
+    point_m: F64
+    chord_m: float
+    half_rad: float
+
+
+def find_junctions(grid: FreeGrid, config: IntersectionsConfig, *, at_m: F64 | None = None) -> list[Junction]:
+    """All junctions near a place, the widest first.
+
+    Args:
+        grid: free space.
+        config: `search_m`, `ring_m`, `ring_width_m`, `min_branch_m`, `max_turn_deg`, `apart_m`, `centre_weight`.
+        at_m: (2,) where the drone is; the middle of the grid without it.
+    """
+    here = np.zeros(2) if at_m is None else at_m
+    free = _reached(grid, here)
+    if free is None:
+        return []
+    clearance = np.asarray(distance_transform_edt(free), dtype=np.float64) * grid.cell_m
+    found: list[Junction] = []
+    for place in _widest(grid, clearance, here, config):
+        junction = _junction_at(grid, free, place, clearance, config)
+        if junction is not None:
+            apart = max(config.apart_m, 1.2 * junction.clearance_m)
+            if all(np.linalg.norm(junction.point_m - other.point_m) > apart for other in found):
+                found.append(junction)
+    return found
+
+
+def _reached(grid: FreeGrid, here: F64) -> Bool | None:
+    """(rows, columns) opened free space that hangs together with the drone's place; None without any."""
+    free = np.asarray(binary_opening(grid.is_open, _CROSS), dtype=np.bool_)
+    parts, count = _parts(free)
+    if not count:
+        return None
+    rows, columns = np.nonzero(free)
+    places = grid.origin_m + grid.cell_m * np.column_stack([columns, rows])
+    nearest = int(np.hypot(*(places - here).T).argmin())
+    return parts == parts[rows[nearest], columns[nearest]]
+
+
+def _parts(mask: Bool) -> tuple[I32, int]:
+    """Connected parts, numbered from 1 on, and how many there are."""
+    numbered, count = cast("tuple[I32, int]", label(mask))
+    return numbered, count
+
+
+def _widest(grid: FreeGrid, clearance: F64, here: F64, config: IntersectionsConfig) -> F64:
+    """(k, 2) local maxima of the clearance, the largest first."""
+    window = 2 * round(0.9 / grid.cell_m) + 1
+    peaks = (clearance == maximum_filter(clearance, window)) & (clearance > 0.5 * config.min_branch_m)
+    rows, columns = np.nonzero(peaks)
+    places = grid.origin_m + grid.cell_m * np.column_stack([columns, rows])
+    near = np.hypot(*(places - here).T) < config.search_m
+    order = np.argsort(-clearance[rows, columns][near], kind="stable")
+    kept: list[F64] = []
+    for place in places[near][order]:
+        if all(np.hypot(*(place - other)) > 0.8 for other in kept):
+            kept.append(place)
+    return np.array(kept).reshape(-1, 2)
+
+
+def _junction_at(
+    grid: FreeGrid, free: Bool, place: F64, clearance: F64, config: IntersectionsConfig
+) -> Junction | None:
+    row, column = grid.cells_of(place[None])
+    room = float(clearance[row[0], column[0]])
+    branches = branches_around(grid, free, place, room, config)
+    if len(branches) < 3:
+        return None
+    point, covariance = invariant_point(branches, place, config)
+    if np.linalg.norm(point - place) > _AGAIN_M:
+        again = branches_around(grid, free, point, room, config)
+        if len(again) >= len(branches):
+            branches = again
+            point, covariance = invariant_point(branches, place, config)
+    if np.linalg.norm(point - place) > 2.0 * room + 1.0:
+        return None  # the lines are nearly parallel: they meet somewhere in the rock
+    return Junction(point, covariance, room, branches)
+
+
+def branches_around(
+    grid: FreeGrid, free: Bool, centre_m: F64, clearance_m: float, config: IntersectionsConfig
+) -> tuple[Branch, ...]:
+    """Arcs of free space that persist over all rings, as branches by rising bearing.
+
+    Args:
+        free: (rows, columns) that hang together with the drone's place.
+        centre_m: (2,) of the rings.
+        clearance_m: free distance there; the rings lie beyond it.
+    """
+    rings = [_arcs(grid, free, centre_m, clearance_m + beyond, config) for beyond in config.ring_m]
+    widest = _WIDEST * clearance_m + 1.0
+    branches = [
+        _branch(chain, centre_m)
+        for arc in rings[-1]
+        if arc.chord_m < widest
+        for chain in [_inwards(arc, rings[-2::-1], np.radians(config.max_turn_deg))]
+        if chain is not None
+    ]
+    # two arcs may run into one: the wider chain stays
+    kept: list[Branch] = []
+    apart = 0.5 * np.radians(config.max_turn_deg)
+    for branch in sorted(branches, key=lambda one: -one.width_m):
+        if all(_between(branch.bearing_rad, other.bearing_rad) > apart for other in kept):
+            kept.append(branch)
+    return tuple(sorted(kept, key=lambda one: one.bearing_rad))
+
+
+def _inwards(arc: _Arc, rings: list[list[_Arc]], turn_rad: float) -> list[_Arc] | None:
+    """The arc with those behind it on the rings towards the centre; None where it does not lead there.
+
+    Branches that leave side by side are one arc on the inner rings: what counts there is that the arc lies within it.
+    """
+    chain = [arc]
+    for arcs in rings:
+        behind = [other for other in arcs if _between(arc.bearing_rad, other.bearing_rad) < other.half_rad + turn_rad]
+        if not behind:
+            return None
+        nearest = min(behind, key=lambda other: _between(arc.bearing_rad, other.bearing_rad))
+        if _between(nearest.bearing_rad, arc.bearing_rad) < turn_rad:
+            chain.insert(0, nearest)
+    return chain
+
+
+def _arcs(grid: FreeGrid, free: Bool, centre_m: F64, radius_m: float, config: IntersectionsConfig) -> list[_Arc]:
+    """The open arcs of one ring that are wide enough and reached from its centre."""
+    reach = radius_m + 0.5 * config.ring_width_m
+    n = len(free)
+    low = np.maximum(np.floor((centre_m - reach - grid.origin_m) / grid.cell_m).astype(np.int64), 0)
+    high = np.minimum(np.ceil((centre_m + reach - grid.origin_m) / grid.cell_m).astype(np.int64) + 1, n)
+    if (low >= high).any():
+        return []
+    part = free[low[1] : high[1], low[0] : high[0]]
+    x = grid.origin_m[0] + grid.cell_m * np.arange(low[0], high[0]) - centre_m[0]
+    y = grid.origin_m[1] + grid.cell_m * np.arange(low[1], high[1]) - centre_m[1]
+    r = np.hypot(x[None, :], y[:, None])
+    parts, _ = _parts(part & (r <= reach))
+    middle = np.unravel_index(np.where(parts > 0, r, np.inf).argmin(), r.shape)
+    ring = (parts == parts[middle]) & (parts > 0) & (np.abs(r - radius_m) <= 0.5 * config.ring_width_m)
+    rows, columns = np.nonzero(ring)
+    if not len(rows):
+        return []
+    bearing = np.arctan2(y[rows], x[columns])
+    filled = np.zeros(_BEARINGS, np.bool_)
+    filled[(bearing % (2 * np.pi) * (_BEARINGS / (2 * np.pi))).astype(np.int64) % _BEARINGS] = True
+    step_m = 2 * np.pi * radius_m / _BEARINGS
+    filled = _closed_ring(filled, max(1, round(1.5 * grid.cell_m / step_m)))
+    out: list[_Arc] = []
+    for first, last in _runs(filled):
+        half = np.pi * (last - first) / _BEARINGS
+        chord = 2.0 * radius_m * float(np.sin(min(half, 0.5 * np.pi)))
+        if chord >= config.min_branch_m:
+            angle = float(np.pi * (first + last) / _BEARINGS)
+            point = centre_m + radius_m * np.array([np.cos(angle), np.sin(angle)])
+            out.append(_Arc(angle % (2 * np.pi), point, chord, half))
+    return out
+
+
+def _closed_ring(filled: Bool, gap: int) -> Bool:
+    """Gaps of at most `gap` bins between filled ones are filled: cells are coarser than bearings near the centre."""
+    out = filled.copy()
+    where = np.flatnonzero(filled)
+    for a, b in pairwise([*where, *(where[:1] + len(filled))]):
+        if b - a <= gap + 1:
+            out[np.arange(a, b) % len(filled)] = True
+    return out
+
+
+def _runs(filled: Bool) -> list[tuple[int, int]]:
+    """(first, end) of the runs on a ring, the end beyond the ring's where a run goes around; a full ring is none."""
+    if filled.all() or not filled.any():
+        return []
+    start = int(np.flatnonzero(~filled)[0])
+    turned = np.roll(filled, -start)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], turned, [False]]).astype(np.int8)))
+    return [(int(a) + start, int(b) + start) for a, b in edges.reshape(-1, 2)]
+
+
+def _branch(chain: list[_Arc], centre_m: F64) -> Branch:
+    points = np.array([arc.point_m for arc in chain])
+    middle = points.mean(axis=0)
+    along = points[-1] - points[0]
+    away = middle - centre_m
+    # of nearby points the direction is noise: the way out from the centre steadies it
+    direction = 0.5 * away / max(float(np.linalg.norm(away)), 1e-9)
+    if len(chain) > 1:
+        direction = direction + along / max(float(np.linalg.norm(along)), 1e-9)
+    bearing = float(np.arctan2(direction[1], direction[0])) % (2 * np.pi)
+    return Branch(bearing, middle, float(np.mean([arc.chord_m for arc in chain])))
+
+
+def invariant_point(branches: tuple[Branch, ...], widest_m: F64, config: IntersectionsConfig) -> tuple[F64, F64]:
+    """The least-squares meeting point of the centre lines, drawn a little to the widest place; (2,) and (2, 2).
+
+    METHOD 5.1 (5): [Σ(I - u uᵀ) + w I] x = Σ(I - u uᵀ) m + w x_D.
+    """
+    A: F64 = config.centre_weight * np.eye(2)
+    b: F64 = config.centre_weight * widest_m
+    for branch in branches:
+        u = np.array([np.cos(branch.bearing_rad), np.sin(branch.bearing_rad)])
+        across = np.eye(2) - np.outer(u, u)
+        A, b = A + across, b + across @ branch.point_m
+    point = np.asarray(np.linalg.solve(A, b), dtype=np.float64)
+    away = [_across(branch, point) for branch in branches]
+    variance = max(float(np.mean(np.square(away))), (0.5 * 0.2) ** 2)
+    return point, np.asarray(variance * np.linalg.inv(A), dtype=np.float64)
+
+
+def _across(branch: Branch, point: F64) -> float:
+    u = np.array([np.cos(branch.bearing_rad), np.sin(branch.bearing_rad)])
+    d = point - branch.point_m
+    return float(u[0] * d[1] - u[1] * d[0])
+
+
+def _between(a: float, b: float) -> float:
+    """Angle between two bearings, in [0, π]."""
+    return float(abs((a - b + np.pi) % (2 * np.pi) - np.pi))

@@ -1,0 +1,134 @@
+"""The plane wall contour vector, PWCV: walls around an invariant point; how alike two are (METHOD 5.1 (6))."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mineloc.compiled import njit
+from mineloc.config import IntersectionsConfig
+from mineloc.data import F32, F64, U8, Sight, WallContour
+from mineloc.places.free_grid import FreeGrid
+
+_STEP_M = 0.1
+
+
+class Likeness(NamedTuple):
+    """How alike two contours are under the best turn.
+
+    Attributes:
+        similarity: in [0, 1]; 0 when too few directions are known in both.
+        yaw_rad: turn of the second's frame that takes its bearings to the first's, in (-π, π].
+    """
+
+    similarity: float
+    yaw_rad: float
+
+
+def wall_contour(grid: FreeGrid, point_m: F64, branches_rad: F64, config: IntersectionsConfig) -> WallContour:
+    """March a ray a bin from the point to the first wall.
+
+    Args:
+        grid: free space; cells that were not seen end a ray as unknown.
+        point_m: (2,) in the grid's frame.
+        branches_rad: (b,) bearings of the roadways that meet.
+        config: `contour_radius_m`, `contour_bins`.
+    """
+    n, radius = config.contour_bins, config.contour_radius_m
+    bearings = 2 * np.pi * np.arange(n) / n
+    steps = np.arange(_STEP_M, radius + 0.5 * _STEP_M, _STEP_M)
+    places = point_m + steps[None, :, None] * np.stack([np.cos(bearings), np.sin(bearings)], axis=1)[:, None, :]
+    rows, columns = grid.cells_of(places.reshape(-1, 2))
+    inside = (rows >= 0) & (columns >= 0) & (rows < grid.sight.shape[0]) & (columns < grid.sight.shape[1])
+    met = np.full(len(rows), Sight.UNKNOWN, np.uint8)
+    met[inside] = grid.sight[rows[inside], columns[inside]]
+    met = met.reshape(n, len(steps))
+    ends = met != Sight.OPEN
+    first = np.where(ends.any(axis=1), ends.argmax(axis=1), len(steps) - 1)
+    sight = met[np.arange(n), first]
+    distance = np.where(sight == Sight.WALL, steps[first] / radius, 0.0).astype(np.float32)
+    return WallContour(distance, sight, radius, np.sort(branches_rad % (2 * np.pi)))
+
+
+def contour_likeness(a: WallContour, b: WallContour, config: IntersectionsConfig) -> Likeness:
+    """Similarity of two contours over all turns; METHOD's S(k) with a parabola through its peak.
+
+    Raises:
+        ValueError: other numbers of bins, or another radius.
+    """
+    curve = likeness_curve(a, b, config)
+    best = int(curve.argmax())
+    n = len(curve)
+    left, here, right = curve[best - 1], curve[best], curve[(best + 1) % n]
+    bend = left - 2 * here + right
+    offset = 0.5 * (left - right) / bend if bend < -1e-12 else 0.0
+    yaw = 2 * np.pi * (best + offset) / n
+    return Likeness(float(here), float((yaw + np.pi) % (2 * np.pi) - np.pi))
+
+
+def likeness_curve(a: WallContour, b: WallContour, config: IntersectionsConfig) -> F64:
+    """(n,) S(k): bin i of b is compared with bin i + k of a.
+
+    Raises:
+        ValueError: other numbers of bins, or another radius.
+    """
+    if len(a.distance) != len(b.distance) or a.radius_m != b.radius_m:
+        raise ValueError("contours of other sizes")
+    scale = (a.radius_m / config.contour_sigma_m) ** 2
+    return _curve(a.distance, a.sight, b.distance, b.sight, scale, config.contour_known)
+
+
+@njit(cache=True, nogil=True)
+def _curve(a: F32, sight_a: U8, b: F32, sight_b: U8, scale: float, least: float) -> F64:
+    n = len(a)
+    kernel = np.empty(1024)
+    for i in range(1024):
+        kernel[i] = np.exp(-scale * (i / 1023.0) ** 2)
+    out = np.zeros(n)
+    for k in range(n):
+        known, total = 0, 0.0
+        for i in range(n):
+            j = i + k
+            if j >= n:
+                j -= n
+            if sight_a[j] == 0 or sight_b[i] == 0:
+                continue
+            known += 1
+            if sight_a[j] == 1 and sight_b[i] == 1:
+                total += kernel[int(abs(a[j] - b[i]) * 1023.0)]
+            elif sight_a[j] == sight_b[i]:
+                total += 1.0
+        if known >= least * n:
+            out[k] = total / known
+    return out
+
+
+def likeness_curve_plainly(a: WallContour, b: WallContour, config: IntersectionsConfig) -> F64:
+    """`likeness_curve` in plain numpy: what the kernel is held to."""
+    n = len(a.distance)
+    out = np.zeros(n)
+    for k in range(n):
+        da, sa = np.roll(a.distance, -k), np.roll(a.sight, -k)
+        known = (sa != Sight.UNKNOWN) & (b.sight != Sight.UNKNOWN)
+        walls = (sa == Sight.WALL) & (b.sight == Sight.WALL)
+        off_m = (da - b.distance) * a.radius_m
+        score = np.where(walls, np.exp(-((off_m / config.contour_sigma_m) ** 2)), (sa == b.sight) & ~walls)
+        if known.sum() >= config.contour_known * n:
+            out[k] = score[known].mean()
+    return out
+
+
+def branches_fit(a_rad: F64, b_rad: F64, yaw_rad: float, *, within_rad: float) -> bool:
+    """Whether all branches of the one that has fewer lie near branches of the other, once b is turned by the yaw.
+
+    Degrees may differ by one: a branch may not have been seen yet.
+    """
+    if abs(len(a_rad) - len(b_rad)) > 1:
+        return False
+    turned = b_rad + yaw_rad
+    few, many = (a_rad, turned) if len(a_rad) <= len(turned) else (turned, a_rad)
+    if not len(few):
+        return True
+    apart = np.abs((few[:, None] - many[None, :] + np.pi) % (2 * np.pi) - np.pi)
+    return bool((apart.min(axis=1) < within_rad).all())

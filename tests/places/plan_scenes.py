@@ -1,0 +1,55 @@
+"""Roadways as walls in a plan, and what a 16-beam LiDAR sees between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mineloc.data import F32, F64
+
+HEIGHT_M, SENSOR_M = 3.0, 1.5
+
+
+class Plan:
+    """Roadways that leave the origin: a place is open if it is within half a width of one of their lines.
+
+    Args:
+        bearings_deg: of the roadways.
+        length_m: of each.
+        width_m: of each.
+        rough_m: amplitude of waves in the walls.
+    """
+
+    def __init__(
+        self, bearings_deg: Sequence[float], *, length_m: float = 30.0, width_m: float = 4.0, rough_m: float = 0.1
+    ) -> None:
+        angles = np.radians(np.array(bearings_deg, dtype=np.float64))
+        self._ahead = np.column_stack([np.cos(angles), np.sin(angles)])
+        self._length, self._half, self._rough = length_m, 0.5 * width_m, rough_m
+
+    def is_open(self, places: F64) -> np.ndarray:
+        """(n,) of (n, 2) places."""
+        along = places @ self._ahead.T
+        left = np.column_stack([-self._ahead[:, 1], self._ahead[:, 0]])
+        across = np.abs(places @ left.T)
+        waves = self._rough * np.sin(1.7 * along + 2.3 * np.arange(len(self._ahead)))
+        return ((along > -0.5 * self._half) & (along < self._length) & (across < self._half + waves)).any(axis=1)
+
+    def sweep(self, at: F64, yaw_rad: float, rng: np.random.Generator) -> F32:
+        """(n, 3) levelled points around the sensor at `at` (2,), x along the heading."""
+        azimuth = np.radians(np.arange(0, 360, 1.5))
+        ranges = np.arange(0.2, 20.0, 0.1)
+        points: list[F64] = []
+        direction = np.column_stack([np.cos(azimuth + yaw_rad), np.sin(azimuth + yaw_rad)])
+        places = at + ranges[None, :, None] * direction[:, None, :]
+        closed = ~self.is_open(places.reshape(-1, 2)).reshape(len(azimuth), len(ranges))
+        wall = np.where(closed.any(axis=1), ranges[closed.argmax(axis=1)], np.inf)
+        for elevation in np.radians(np.arange(-15, 16, 2.0)):
+            rise = np.tan(elevation)
+            ceiling = (HEIGHT_M - SENSOR_M) / rise if rise > 0 else (-SENSOR_M / rise if rise < 0 else np.inf)
+            r = np.minimum(wall, ceiling)
+            seen = np.isfinite(r)
+            r = r[seen] + rng.normal(0, 0.02, int(seen.sum()))
+            points.append(np.column_stack([r * np.cos(azimuth[seen]), r * np.sin(azimuth[seen]), r * rise]))
+        return np.concatenate(points).astype(np.float32)

@@ -1,0 +1,133 @@
+"""Intersections of a map's free space: drawn as a sheet of cells, found with their kinds and neighbours."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from plan_scenes import Plan
+
+from mineloc.config import IntersectionsConfig
+from mineloc.data import Intersection, MapCloud
+from mineloc.places.database import database_of
+from mineloc.places.segmentation import intersections_of, kind_of
+from mineloc.places.sheet_grid import sheet_grid
+from mineloc.roadways.centre_lines import centre_lines
+from mineloc.roadways.mapped import MappedRoadway, MappedRoadways
+from mineloc.roadways.sheet import Sheet, link
+
+CONFIG = IntersectionsConfig()
+CELL_M = CONFIG.cell_m
+
+
+def sheet_of(is_open: np.ndarray, origin_m: np.ndarray) -> Sheet:
+    """Cells of one level, 3 m high."""
+    row, column = np.nonzero(is_open)
+    floor = np.zeros(len(row))
+    links = link(column, row, floor, floor + 3.0, 1.2)
+    return Sheet(CELL_M, origin_m, column, row, floor, floor + 3.0, links)
+
+
+def drawn() -> Sheet:
+    """A T at the origin and a crossing 30 m east of it."""
+    axis = np.arange(-25, 60, CELL_M)
+    x, y = np.meshgrid(axis, axis)
+    places = np.column_stack([x.ravel(), y.ravel()])
+    one = Plan((0, 90, 180), length_m=22.0).is_open(places)
+    other = Plan((0, 90, 180, 270), length_m=22.0, width_m=3.4).is_open(places - [30.0, 0.0])
+    return sheet_of((one | other).reshape(x.shape), np.array([-25.0, -25.0]))
+
+
+def walls_of(sheet: Sheet) -> MapCloud:
+    edge = (sheet.links < 0).any(axis=1)
+    foot = sheet.floor_points_m(np.flatnonzero(edge))
+    points = np.concatenate([foot + np.array([0, 0, z]) for z in np.arange(0.1, 3, 0.3)])
+    n = len(points)
+    return MapCloud(
+        origin_m=np.zeros(3),
+        points_m=points.astype(np.float32),
+        normals=np.tile(np.array([0, 0, 1], np.float32), (n, 1)),
+        counts=np.full(n, 9, np.int32),
+        visits=np.full(n, 2, np.int32),
+        thickness_m=np.full(n, 0.01, np.float32),
+        near_m=np.full(n, 2.0, np.float32),
+        surface=np.full(n, 2, np.uint8),
+        voxel_m=0.2,
+    )
+
+
+def mapped(sheet: Sheet) -> MappedRoadways:
+    graph = centre_lines(sheet, rooms_overlap=True)
+    roads = tuple(
+        MappedRoadway(road.a, road.b, road.line_m, *(np.full(len(road.line_m), v) for v in (2.0, 2.0, 3.0)))
+        for road in graph.roadways
+    )
+    return MappedRoadways(graph.nodes_m, roads, 1.2)
+
+
+@pytest.fixture(scope="module")
+def found() -> list[Intersection]:
+    sheet = drawn()
+    return intersections_of(sheet, walls_of(sheet), mapped(sheet), CONFIG)
+
+
+def test_both_are_found_where_they_are_with_their_kinds(found: list[Intersection]) -> None:
+    assert [one.kind for one in found] == ["T", "X"]
+    assert found[0].point_map == pytest.approx([0, 0, 0], abs=0.5)
+    assert found[1].point_map == pytest.approx([30, 0, 0], abs=0.5)
+    assert np.degrees(found[0].contour.branches_rad) == pytest.approx([0, 90, 180], abs=10) or found[0].degree == 3
+    assert found[1].degree == 4
+
+
+def test_they_are_neighbours_by_the_way_between(found: list[Intersection]) -> None:
+    for one, other in ((found[0], found[1]), (found[1], found[0])):
+        ((id, length_m),) = one.neighbours
+        assert id == other.id
+        assert length_m == pytest.approx(30, abs=2)
+
+
+def test_the_cloud_lies_around_the_point(found: list[Intersection]) -> None:
+    for one in found:
+        reach = np.linalg.norm(one.points_m[:, :2], axis=1)
+        assert 14.0 < reach.max() <= CONFIG.cloud_radius_m + 0.01
+        assert len(one.normals) == len(one.points_m) > 500
+        assert (one.matrix > 0).mean() > 0.05
+        assert one.contour.walls > 60
+
+
+def test_a_database_of_two_unlike_ones_has_no_twins_and_of_one_place_twice_has(found: list[Intersection]) -> None:
+    facts = {"grid_origin_m": np.zeros(3), "is_grid": False, "map_sha256": ""}
+    known = database_of(found, CONFIG, **facts)
+    assert known.twins == ()
+    assert known.contour_similarity[0, 1] < known.contour_threshold
+    again = [found[0], found[1], *[_renumbered(found[1], 7)]]
+    assert database_of(again, CONFIG, **facts).twins == ((1, 7),)
+
+
+def _renumbered(one: Intersection, id: int) -> Intersection:
+    values = {name: getattr(one, name) for name in Intersection.__dataclass_fields__}
+    return Intersection(**{**values, "id": id})
+
+
+def test_a_grid_of_a_sheet_has_walls_around_its_open_cells_and_one_level() -> None:
+    sheet = drawn()
+    start = int(np.hypot(*sheet.floor_points_m(np.arange(len(sheet)))[:, :2].T).argmin())
+    grid = sheet_grid(sheet, start, np.zeros(3), CONFIG)
+    rows, columns = grid.cells_of(np.array([[0.0, 0.0], [0.0, -2.1], [0.0, -6.0], [10.0, 0.0]]))
+    assert grid.sight[rows, columns].tolist() == [2, 1, 0, 2]
+    with pytest.raises(ValueError, match="cells"):
+        sheet_grid(sheet, start, np.zeros(3), CONFIG.model_copy(update={"cell_m": 0.3}))
+
+
+@pytest.mark.parametrize(
+    ("bearings_deg", "kind"),
+    [
+        ((10, 100, 190), "T"),
+        ((0, 120, 240), "Y"),
+        ((0, 150, 210), "Y"),
+        ((0, 90, 180, 270), "X"),
+        (range(0, 360, 72), "other"),
+    ],
+)
+def test_the_kind_follows_from_the_bearings(bearings_deg, kind: str) -> None:
+    for turn in (0, 77, 180, 300):
+        assert kind_of(np.radians((np.array(bearings_deg) + turn) % 360)) == kind
