@@ -36,6 +36,7 @@ class LocalizeResult:
     Attributes:
         out: the run folder.
         sweeps, keyframes, untrusted, degenerate: counts; `untrusted` sweeps rest on the motion prior alone.
+        fixes, fixes_refused: keyframes that the map or a place seen before holds, and those that were refused.
         path_m: length of the smoothed trajectory.
         sweeps_per_s, real_time_factor: of the whole run, reading included.
     """
@@ -45,6 +46,8 @@ class LocalizeResult:
     keyframes: int
     untrusted: int
     degenerate: int
+    fixes: int
+    fixes_refused: int
     path_m: float
     sweeps_per_s: float
     real_time_factor: float
@@ -54,10 +57,13 @@ class LocalizeResult:
         return {**asdict(self), "out": str(self.out)}
 
     def summary(self) -> str:
-        """Two lines for people."""
+        """Two lines for people, three where something was recognised or refused."""
         doubt = f"{self.untrusted} sweeps rest on the motion prior alone, {self.degenerate} are weak in a direction"
+        tried = self.fixes + self.fixes_refused
+        found = f"{self.fixes} of {tried} fixes accepted\n" if tried else ""
         return (
             f"{self.out}: {self.sweeps} sweeps, {self.keyframes} keyframes, {self.path_m:.1f} m; {doubt}\n"
+            f"{found}"
             f"{self.sweeps_per_s:.1f} sweeps/s, {self.real_time_factor:.1f} times real time"
         )
 
@@ -123,6 +129,8 @@ def localize(
         keyframes=len(found.keyframes),
         untrusted=counts["untrusted"],
         degenerate=counts["degenerate"],
+        fixes=counts["fixes_accepted"],
+        fixes_refused=counts["fixes_refused"],
         path_m=float(smoothed.path_m[-1]),
         sweeps_per_s=timing["sweeps_per_s"],
         real_time_factor=timing["real_time_factor"],

@@ -9,14 +9,16 @@ import pytest
 from rough_mine import START_NS, WIDTH_M, ring, roadway_along, write_flight
 
 from mineloc import se3
-from mineloc.config import layered_config
+from mineloc.config import Config, layered_config
 from mineloc.data import F64, ControlPoint, Observation, SurfaceKind
 from mineloc.errors import ConfigError, FlightError, IngestError, OutputError
 from mineloc.io.clouds import read_cloud
 from mineloc.io.control_points import control_points_csv, observations_csv
 from mineloc.metrics.alignment import umeyama
+from mineloc.stages.localize import localize
 from mineloc.stages.map_folder import MapFolder
 from mineloc.stages.reconstruct import ReconstructResult, reconstruct
+from mineloc.stages.run_folder import RunFolder
 
 SMALL = layered_config(
     [{"loops": {"submap_keyframes": 3, "submap_reach_m": 12.0}, "map": {"max_range_m": 8.0}}], where="test"
@@ -70,6 +72,49 @@ def test_the_trajectory_is_that_of_the_flight(made, flight):
     T = umeyama(truth[:, :3, 3], estimate.positions_m)
     error = np.linalg.norm(se3.apply(T, estimate.positions_m) - truth[:, :3, 3], axis=1)
     assert np.sqrt(np.mean(error**2)) < 0.05
+
+
+def in_the_map(start_m: list[float] | None) -> Config:
+    start = {} if start_m is None else {"prior_map": {"start_m": start_m}}
+    return layered_config([{"loops": {"submap_keyframes": 3}}, start], where="test")
+
+
+def test_a_flight_is_tracked_in_the_map_that_was_made(made, flight, tmp_path):
+    _, survey = made
+    arguments = {"method": "map_tracking", "prior_map": survey.path}
+    result = localize(flight[0], tmp_path / "run", **arguments, config=in_the_map([0.0, 0.0, 0.0]))
+    assert result.fixes > 0.95 * result.keyframes
+    assert "fixes accepted" in result.summary()
+    run = RunFolder.open(tmp_path / "run")
+    mapped = survey.trajectories["a"]
+    for trajectory in (run.smoothed, run.online):
+        assert np.linalg.norm(trajectory.positions_m - mapped.positions_m, axis=1)[20:].max() < 0.1
+
+
+def test_a_flight_that_begins_elsewhere_than_told_has_no_fix(made, flight, tmp_path):
+    _, survey = made
+    arguments = {"method": "map_tracking", "prior_map": survey.path}
+    result = localize(flight[0], tmp_path / "run", **arguments, config=in_the_map([300.0, 0.0, 0.0]))
+    assert result.fixes == 0
+    assert result.fixes_refused == result.keyframes
+
+
+def test_tracking_without_map_or_start_is_refused_before_any_work(made, flight, tmp_path):
+    _, survey = made
+    cases = (
+        ("needs a map", lambda: localize(flight[0], tmp_path / "run", method="map_tracking", config=SMALL)),
+        (
+            "start_m: is not set",
+            lambda: localize(
+                flight[0], tmp_path / "run", method="map_tracking", prior_map=survey.path, config=in_the_map(None)
+            ),
+        ),
+        ("needs a map", lambda: reconstruct([flight[0]], tmp_path / "run", method="map_tracking", config=SMALL)),
+    )
+    for match, attempt in cases:
+        with pytest.raises(ConfigError, match=match):
+            attempt()
+        assert not (tmp_path / "run").exists()
 
 
 def test_walls_lie_where_they_are(made, flight, mine):
