@@ -177,6 +177,7 @@ def localize(
     method: Annotated[str, typer.Option("--method", help="odometry, odometry_loops, loam, loam_scan_context …")],
     out: Annotated[Path, typer.Option("--out", help="The run folder to write.")],
     prior_map: Annotated[Path | None, typer.Option("--map", help="A map folder, for map_tracking.")] = None,
+    database: Annotated[Path | None, typer.Option("--database", help="Of a map, for intersections_map.")] = None,
     recording: Annotated[bool, typer.Option(help="Also write run.rrd, what `mineloc view` shows.")] = True,
     as_json: JsonOption = False,
     config: ConfigOption = None,
@@ -189,7 +190,9 @@ def localize(
 
     settings = load_config(config, overrides or ())
     with progress_bar("localize") as progress:
-        result = run_stage(flight, out, method=method, prior_map=prior_map, config=settings, progress=progress)
+        result = run_stage(
+            flight, out, method=method, prior_map=prior_map, database=database, config=settings, progress=progress
+        )
     if recording:
         from mineloc.view.run import record_run
 

@@ -1,52 +1,62 @@
-"""Where a drone is in a prior map, keyframe by keyframe: odometry carries it on, registration to the map corrects it.
-
-A Kalman filter on the pose alone. It is causal: what it says of a keyframe rests on that keyframe and those before.
-"""
+"""Where a drone is in a prior map, keyframe by keyframe: by registration to the map, or by its intersections."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Protocol
+
 import numpy as np
 
-from mineloc import se3
 from mineloc.config import PriorMapConfig
-from mineloc.data import F64, Fix, Keyframe, RelativePose
-from mineloc.localize.prior_map import MapRegistration, PriorMap
+from mineloc.data import F64, Fix, Intersection, Keyframe, RelativePose
+from mineloc.localize.pose_filter import PoseFilter
+from mineloc.localize.prior_map import PriorMap
+from mineloc.localize.recognition import Recognizer
+
+
+class Tracker(Protocol):
+    """Follows a flight through a map.
+
+    Attributes:
+        filter: pose and covariance at the newest keyframe.
+    """
+
+    filter: PoseFilter
+
+    def follow(self, keyframe: Keyframe, edge: RelativePose | None) -> Fix:
+        """Carry the pose to the next keyframe and correct it by what is seen there.
+
+        Args:
+            keyframe: with points.
+            edge: what leads to it; None for the first.
+        """
+        ...
 
 
 class MapTracker:
-    """Follows a flight through a prior map.
+    """Every keyframe registered to the map around where it is expected.
 
     Args:
         prior_map: of the mine.
         config: gates and noise.
         T_map_lidar: (4, 4) of the first keyframe.
         covariance: (6, 6) of that, `[rotation, translation]`, right perturbation.
-
-    Attributes:
-        T_map_lidar: (4, 4) of the newest keyframe.
-        covariance: (6, 6) of that.
     """
 
     def __init__(self, prior_map: PriorMap, config: PriorMapConfig, *, T_map_lidar: F64, covariance: F64) -> None:
         self._map, self._config = prior_map, config
-        self.T_map_lidar, self.covariance = T_map_lidar, covariance
+        self.filter = PoseFilter(T_map_lidar, covariance)
 
     def follow(self, keyframe: Keyframe, edge: RelativePose | None) -> Fix:
-        """Carry the pose to the next keyframe and register that to the map.
-
-        Args:
-            keyframe: with points.
-            edge: what leads to it; None for the first.
-        """
+        """As `Tracker.follow`."""
         if edge is not None:
-            self._carry(edge)
-        found = self._map.register(keyframe.points_lidar, self.T_map_lidar, self.covariance)
-        sigmas = self._sigmas_away(found)
+            self.filter.carry(edge)
+        found = self._map.register(keyframe.points_lidar, self.filter.T_map_lidar, self.filter.covariance)
+        c = self._config
+        sigmas = self.filter.sigmas_away(found.T_map_lidar, floor_m=c.moved_floor_m, floor_deg=c.moved_floor_deg)
         reason = found.reason
-        if not reason and sigmas > self._config.max_moved_sigmas:
-            reason = (
-                f"{sigmas:.1f} sigmas from where odometry expects it, at most {self._config.max_moved_sigmas} allowed"
-            )
+        if not reason and sigmas > c.max_moved_sigmas:
+            reason = f"{sigmas:.1f} sigmas from the prediction, at most {c.max_moved_sigmas} allowed"
         covariance = np.asarray(np.linalg.inv(found.information), dtype=np.float64)
         fix = Fix(
             stamp_ns=keyframe.stamp_ns,
@@ -65,27 +75,42 @@ class MapTracker:
             },
         )
         if fix.trusted:
-            self._correct(fix)
+            self.filter.correct(fix)
         return fix
 
-    def _carry(self, edge: RelativePose) -> None:
-        back = se3.adjoint(se3.inverse(edge.T_i_j))
-        self.T_map_lidar = se3.rigid(self.T_map_lidar @ edge.T_i_j)
-        self.covariance = back @ self.covariance @ back.T + np.linalg.inv(edge.information)
 
-    def _correct(self, fix: Fix) -> None:
-        assert fix.T_map_lidar is not None
-        assert fix.covariance is not None
-        error = se3.log(se3.rigid(se3.inverse(self.T_map_lidar) @ fix.T_map_lidar))
-        gain = self.covariance @ np.linalg.inv(self.covariance + fix.covariance)
-        self.T_map_lidar = se3.rigid(self.T_map_lidar @ se3.exp(gain @ error))
-        # Joseph's form stays symmetric and positive
-        rest = np.eye(6) - gain
-        self.covariance = rest @ self.covariance @ rest.T + gain @ fix.covariance @ gain.T
+class IntersectionTracker:
+    """Odometry alone, but at intersections of the database (paper A, 1.6 and 1.7).
 
-    def _sigmas_away(self, found: MapRegistration) -> float:
-        """Mahalanobis distance of the correction, a component."""
+    Args:
+        recognizer: of the mine's intersections.
+        config: gates.
+        T_map_lidar, covariance: as for `MapTracker`.
+    """
+
+    def __init__(self, recognizer: Recognizer, config: PriorMapConfig, *, T_map_lidar: F64, covariance: F64) -> None:
+        self._recognizer, self._config = recognizer, config
+        self.filter = PoseFilter(T_map_lidar, covariance)
+
+    def follow(self, keyframe: Keyframe, edge: RelativePose | None) -> Fix:
+        """As `Tracker.follow`."""
+        if edge is not None:
+            self.filter.carry(edge)
+        fix = self._recognizer.follow(keyframe, self._is_possible)
+        if not fix.trusted or fix.T_map_lidar is None:
+            return fix
         c = self._config
-        error = se3.log(se3.rigid(se3.inverse(self.T_map_lidar) @ found.T_map_lidar))
-        floor = np.diag([np.radians(c.moved_floor_deg) ** 2] * 3 + [c.moved_floor_m**2] * 3)
-        return float(np.sqrt(error @ np.linalg.solve(self.covariance + floor, error) / 6.0))
+        sigmas = self.filter.sigmas_away(fix.T_map_lidar, floor_m=c.moved_floor_m, floor_deg=c.moved_floor_deg)
+        fix = replace(fix, scores={**fix.scores, "sigmas": sigmas})
+        if sigmas > c.max_moved_sigmas:
+            reason = f"{sigmas:.1f} sigmas from the prediction, at most {c.max_moved_sigmas} allowed"
+            return replace(fix, trusted=False, reason=reason)
+        self.filter.correct(fix)
+        return fix
+
+    def _is_possible(self, known: Intersection, T_map_lidar: F64) -> bool:
+        """Before registration: an invariant point is known to some decimetres, its turn to some degrees."""
+        del known
+        c = self._config
+        sigmas = self.filter.sigmas_away(T_map_lidar, floor_m=c.seen_floor_m, floor_deg=c.seen_floor_deg)
+        return sigmas <= c.max_moved_sigmas

@@ -1,21 +1,24 @@
-"""Localization in a prior map: every keyframe is registered to it, and where it does not fit odometry goes on alone."""
+"""Localization in a prior map: by registration to it or by its intersections; between fixes odometry goes on alone."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from mineloc import se3
 from mineloc.config import Config, PriorMapConfig
-from mineloc.data import F64, Fix, OdometryStep
+from mineloc.data import F64, Fix, IntersectionDatabase, OdometryStep
+from mineloc.errors import ConfigError
 from mineloc.graph.batch import solve
 from mineloc.graph.pose_graph import PoseGraph
 from mineloc.localize.flown import counts_of, first_origin, front_end_steps
 from mineloc.localize.kept import Kept
 from mineloc.localize.localization import FlightData, Localization
-from mineloc.localize.map_tracker import MapTracker
+from mineloc.localize.map_tracker import IntersectionTracker, MapTracker, Tracker
 from mineloc.localize.prior_map import PriorMap
+from mineloc.localize.recognition import Recognizer
 from mineloc.odometry.front_end import FrontEnd
 from mineloc.progress import Progress
 
@@ -52,29 +55,53 @@ class Prior:
     """What is known before a flight.
 
     Attributes:
-        map: of the mine.
-        start: where the flight begins in it.
+        start: where the flight begins in the map.
+        map: of the mine, for `map_tracking`.
+        database: of its intersections, for `intersections_map`.
     """
 
-    map: PriorMap
     start: Start
+    map: PriorMap | None = None
+    database: IntersectionDatabase | None = None
+
+    def tracker(self, config: Config, T_map_lidar: F64, *, by: Literal["map", "intersections"]) -> Tracker:
+        """What follows a flight that begins at a pose.
+
+        Raises:
+            ConfigError: what it needs is not there.
+        """
+        covariance = self.start.covariance
+        if by == "map":
+            if self.map is None:
+                raise ConfigError("--method", "the method needs a map", expected="--map MAP/", todo="name a map folder")
+            return MapTracker(self.map, config.prior_map, T_map_lidar=T_map_lidar, covariance=covariance)
+        if self.database is None:
+            raise ConfigError(
+                "--method", "the method needs a database", expected="--database DB.mcap", todo="make one of a map"
+            )
+        recognizer = Recognizer(config, self.database)
+        return IntersectionTracker(recognizer, config.prior_map, T_map_lidar=T_map_lidar, covariance=covariance)
 
 
 class MapTracking:
-    """Odometry and the prior map: a filter online, all fixes and relative poses in the graph when the flight is over.
+    """Odometry and a tracker: a filter online, all fixes and relative poses in the graph when the flight is over.
 
     Args:
         config: of all sections that a method reads.
         front_end: turns sweeps into poses.
-        prior: map and start.
+        prior: what is known, and where the flight begins in it.
+        by: what holds the drone.
     """
 
-    def __init__(self, config: Config, front_end: FrontEnd, prior: Prior) -> None:
+    def __init__(
+        self, config: Config, front_end: FrontEnd, prior: Prior, *, by: Literal["map", "intersections"]
+    ) -> None:
         self._config, self._front_end = config, front_end
-        self._map, self._start = prior.map, prior.start
+        self._by: Literal["map", "intersections"] = by
+        self._prior, self._start = prior, prior.start
         self._graph = PoseGraph(config.graph)
         self._kept = Kept()
-        self._tracker: MapTracker | None = None
+        self._tracker: Tracker | None = None
         self._fixes: list[Fix] = []
         self._T_map_odom: F64 = np.eye(4)  # as known now
 
@@ -89,7 +116,7 @@ class MapTracking:
             if not self._kept.steps:
                 self._T_map_odom = self._start.T_map_level @ first_origin(step, flight.calibration.T_body_lidar)
             if step.keyframe is not None:
-                with clock.of("map"):
+                with clock.of(self._by):
                     self._place(step)
             self._kept.add_step(step, self._T_map_odom)
         with clock.of("graph_batch"):
@@ -105,10 +132,9 @@ class MapTracking:
         else:
             self._graph.add_next(keyframe, step.relative_pose)
         if self._tracker is None:
-            covariance = self._start.covariance
-            self._tracker = MapTracker(self._map, self._config.prior_map, T_map_lidar=expected, covariance=covariance)
+            self._tracker = self._prior.tracker(self._config, expected, by=self._by)
         fix = self._tracker.follow(keyframe, step.relative_pose)
         self._fixes.append(fix)
         if fix.trusted:
             self._graph.add_fix(fix)
-        self._T_map_odom = self._tracker.T_map_lidar @ se3.inverse(keyframe.T_odom_lidar)
+        self._T_map_odom = self._tracker.filter.T_map_lidar @ se3.inverse(keyframe.T_odom_lidar)

@@ -43,14 +43,14 @@ class Method:
         make_front_end: from configuration and calibration.
         summary: one line for people.
         loops: where loop closures come from: "place" (Scan Context), "position" (the estimate), both or none.
-        needs_map: it localizes in a prior map.
+        tracks: what of a prior map it localizes by.
     """
 
     front_end: str
     make_front_end: Callable[[Config, Calibration], FrontEnd]
     summary: str
     loops: frozenset[Literal["place", "position"]] = frozenset()
-    needs_map: bool = False
+    tracks: Literal["map", "intersections"] | None = None
 
     def closer(self, config: Config) -> LoopCloser | None:
         """What finds the method's loop closures, None for an open-loop method."""
@@ -71,10 +71,15 @@ class Method:
             FlightError: fewer than two sweeps, no points, time going backwards.
         """
         front_end = self.make_front_end(config, flight.calibration)
-        if self.needs_map:
+        if self.tracks is not None:
             if prior is None:
-                raise ConfigError("--method", "the method needs a map", expected="--map MAP/", todo="name a map folder")
-            return MapTracking(config, front_end, prior).run(flight, progress)
+                raise ConfigError(
+                    "--method",
+                    f"the method needs {'a map' if self.tracks == 'map' else 'a database'}",
+                    expected="--map MAP/" if self.tracks == "map" else "--database DB.mcap",
+                    todo="name one",
+                )
+            return MapTracking(config, front_end, prior, by=self.tracks).run(flight, progress)
         return GraphMethod(config, front_end, closer=self.closer(config)).run(flight, progress)
 
 
@@ -89,7 +94,10 @@ METHODS: dict[str, Method] = {
     "link3d_scan_context": Method(
         "link3d", _link3d, "paper B: LinK3D and Scan Context loop closures", frozenset({"place"})
     ),
-    "map_tracking": Method("mineloc", _mineloc, "every keyframe registered to a prior map", needs_map=True),
+    "map_tracking": Method("mineloc", _mineloc, "every keyframe registered to a prior map", tracks="map"),
+    "intersections_map": Method(
+        "mineloc", _mineloc, "paper A: the intersections of a database, recognised in flight", tracks="intersections"
+    ),
 }
 
 

@@ -12,6 +12,8 @@ from mineloc.data import F32, F64, U8, Sight, WallContour
 from mineloc.places.free_grid import FreeGrid
 
 _STEP_M = 0.1
+_PEAKS, _PEAK_BINS = 4, 10
+"""At most so many turns, at least so many bins apart."""
 
 
 class Likeness(NamedTuple):
@@ -58,12 +60,33 @@ def contour_likeness(a: WallContour, b: WallContour, config: IntersectionsConfig
         ValueError: other numbers of bins, or another radius.
     """
     curve = likeness_curve(a, b, config)
-    best = int(curve.argmax())
+    return _at(curve, int(curve.argmax()))
+
+
+def likeness_peaks(a: WallContour, b: WallContour, config: IntersectionsConfig) -> list[Likeness]:
+    """The best turn and others nearly as good, the best first: an X looks the same from four sides.
+
+    Raises:
+        ValueError: as `likeness_curve`.
+    """
+    curve = likeness_curve(a, b, config)
+    is_peak = (curve >= np.roll(curve, 1)) & (curve > np.roll(curve, -1)) & (curve >= curve.max() - config.peak_drop)
+    ranked = np.flatnonzero(is_peak & (curve > 0))
+    ranked = ranked[np.argsort(-curve[ranked], kind="stable")]
+    kept: list[int] = []
+    for k in ranked.tolist():
+        if all(min(abs(k - other), len(curve) - abs(k - other)) > _PEAK_BINS for other in kept):
+            kept.append(k)
+    return [_at(curve, k) for k in kept[:_PEAKS]]
+
+
+def _at(curve: F64, k: int) -> Likeness:
+    """The likeness at a bin, the turn refined by a parabola."""
     n = len(curve)
-    left, here, right = curve[best - 1], curve[best], curve[(best + 1) % n]
+    left, here, right = curve[k - 1], curve[k], curve[(k + 1) % n]
     bend = left - 2 * here + right
     offset = 0.5 * (left - right) / bend if bend < -1e-12 else 0.0
-    yaw = 2 * np.pi * (best + offset) / n
+    yaw = 2 * np.pi * (k + offset) / n
     return Likeness(float(here), float((yaw + np.pi) % (2 * np.pi) - np.pi))
 
 

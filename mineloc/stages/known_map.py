@@ -1,4 +1,4 @@
-"""A map folder as what is known before a flight."""
+"""What is known before a flight: a map folder, a database of its intersections, or both."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from mineloc.config import Config
-from mineloc.data import Trajectory
+from mineloc.data import F64, IntersectionDatabase, Trajectory
 from mineloc.errors import ConfigError
 from mineloc.io.flight import FlightReader
+from mineloc.io.intersection_database import read_database
 from mineloc.localize.map_tracking import Prior, Start
 from mineloc.localize.prior_map import PriorMap
 from mineloc.sim.targets import GRID_FILE
@@ -27,44 +28,71 @@ class KnownMap:
 
     Attributes:
         prior: for methods.
-        survey: the folder.
+        grid_origin_m: (3,) of its frame in the mine grid.
+        is_grid: whether it stands in the mine grid.
+        map_sha256: of the manifest of the map.
     """
 
     prior: Prior
-    survey: MapFolder
+    grid_origin_m: F64
+    is_grid: bool
+    map_sha256: str
 
     @staticmethod
-    def open(path: Path, config: Config) -> KnownMap:
-        """Read a map folder.
+    def open(prior_map: Path | None, database: Path | None, config: Config) -> KnownMap | None:
+        """Read a map folder, a database of intersections, or both; None without either.
 
         Raises:
-            FormatError: not a map folder, or damaged.
-            ConfigError: nothing says where the flight begins.
+            FormatError: not a map folder or no database, or damaged.
+            ConfigError: they are of two maps, or nothing says where the flight begins.
         """
-        survey = MapFolder.open(path)
-        start = Start.of(config.prior_map, survey.grid_origin_m)
-        if start is None:
-            raise ConfigError(
-                "prior_map.start_m",
-                "is not set",
-                expected="where the drone begins, in the frame of the map",
-                todo="set it, and prior_map.start_yaw_deg",
-            )
-        return KnownMap(Prior(PriorMap(survey.cloud(), config.prior_map, config.odometry), start), survey)
+        survey = None if prior_map is None else MapFolder.open(prior_map)
+        known = None if database is None else read_database(database)
+        if survey is not None:
+            digest = hashlib.sha256((survey.path / "manifest.json").read_bytes()).hexdigest()
+            if known is not None and known.map_sha256 != digest:
+                raise ConfigError(
+                    str(database),
+                    "is of another map",
+                    expected=f"the database of {prior_map}",
+                    todo="make it of this map",
+                )
+            origin, is_grid = survey.grid_origin_m, bool(survey.manifest["frame"]["is_grid"])
+        elif known is not None:
+            digest, origin, is_grid = known.map_sha256, known.grid_origin_m, known.is_grid
+        else:
+            return None
+        return KnownMap(_prior(survey, known, config, origin), origin, is_grid, digest)
 
     def reference_of(self, reader: FlightReader) -> Trajectory | None:
         """The flight's reference in the frame of the map; None when it has none, or its frame is not known."""
         reference = reader.reference()
-        if reference is None or not self.survey.manifest["frame"]["is_grid"]:
-            return reference
-        if GRID_FILE not in reader.attachment_names:
+        if reference is None or not self.is_grid or GRID_FILE not in reader.attachment_names:
             return reference
         T_grid_map = np.array(json.loads(reader.attachment(GRID_FILE))["T_grid_map"])
-        T_grid_map[:3, 3] -= self.survey.grid_origin_m
+        T_grid_map[:3, 3] -= self.grid_origin_m
         return reference.compose(left=T_grid_map)
 
     @property
     def facts(self) -> Mapping[str, Any]:
         """For the manifest of a run."""
-        content = (self.survey.path / "manifest.json").read_bytes()
-        return {"manifest_sha256": hashlib.sha256(content).hexdigest(), "frame": dict(self.survey.manifest["frame"])}
+        return {
+            "manifest_sha256": self.map_sha256,
+            "grid_origin_m": self.grid_origin_m.tolist(),
+            "is_grid": self.is_grid,
+        }
+
+
+def _prior(
+    survey: MapFolder | None, database: IntersectionDatabase | None, config: Config, grid_origin_m: F64
+) -> Prior:
+    start = Start.of(config.prior_map, grid_origin_m)
+    if start is None:
+        raise ConfigError(
+            "prior_map.start_m",
+            "is not set",
+            expected="where the drone begins, in the frame of the map",
+            todo="set it, and prior_map.start_yaw_deg",
+        )
+    patches = None if survey is None else PriorMap(survey.cloud(), config.prior_map, config.odometry)
+    return Prior(start, patches, database)

@@ -26,7 +26,18 @@ from mineloc.stages.run_tables import fixes_table, pose_columns, sigmas
 
 POINTS_A_KEYFRAME = 250
 """Enough to draw the mine; the map of a survey comes from `reconstruct`."""
-_SECTIONS = {"sweep", "keyframe", "odometry", "loam", "link3d", "scan_context", "loops", "graph", "prior_map"}
+_SECTIONS = {
+    "sweep",
+    "keyframe",
+    "odometry",
+    "loam",
+    "link3d",
+    "scan_context",
+    "loops",
+    "graph",
+    "prior_map",
+    "intersections",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +85,7 @@ def localize(
     *,
     method: str,
     prior_map: Path | None = None,
+    database: Path | None = None,
     config: Config | None = None,
     progress: Progress = quiet,
 ) -> LocalizeResult:
@@ -84,19 +96,20 @@ def localize(
         out: the run folder.
         method: by its name.
         prior_map: a map folder, for methods that need one; poses and reference are then told in its frame.
+        database: of its intersections, for methods that need one; the same.
         config: all sections.
         progress: told the sweeps that are done.
 
     Raises:
         ConfigError: no such method, a method without its map, a map without a start.
-        FormatError: `prior_map` is not a map folder.
+        FormatError: `prior_map` is not a map folder, or `database` no database.
         IngestError: `flight` is not a canonical flight, or damaged.
         FlightError: it holds too little to localize.
         OutputError: `out` exists or cannot be written.
     """
     config = config or Config()
     chosen = method_named(method)
-    known = None if prior_map is None else KnownMap.open(prior_map, config)
+    known = KnownMap.open(prior_map, database, config) if chosen.tracks is not None else None
     with new_folder(out) as folder, FlightReader(flight) as reader:
 
         def counted(done: float, total: float | None, unit: str) -> None:

@@ -108,7 +108,7 @@ def reconstruct(
     started, clock = perf_counter(), Clock()
     config = config or Config()
     chosen = method_named(method)
-    if chosen.needs_map:
+    if chosen.tracks is not None:
         raise ConfigError("--method", f"{method} needs a map", expected="a method that makes one", todo=f"try {METHOD}")
     with new_folder(out) as folder, ExitStack() as stack:
         work = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=folder)))

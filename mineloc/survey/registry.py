@@ -10,7 +10,7 @@ LOCALIZE = Stage(
     "localize",
     1,
     "mineloc.stages.localize:localize",
-    ("sweep", "keyframe", "odometry", "loam", "link3d", "scan_context", "loops", "graph", "prior_map"),
+    ("sweep", "keyframe", "odometry", "loam", "link3d", "scan_context", "loops", "graph", "prior_map", "intersections"),
     volatile=frozenset({"timing.json"}),
 )
 RECONSTRUCT = Stage(

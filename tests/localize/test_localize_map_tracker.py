@@ -63,7 +63,7 @@ def track(flown: Drifted, prior: PriorMap, *, off: F64 | None = None) -> tuple[l
     fixes, errors = [], []
     for keyframe, edge, T in zip(flown.keyframes, flown.edges, shifted, strict=True):
         fixes.append(tracker.follow(keyframe, edge))
-        errors.append(np.linalg.norm((se3.inverse(T) @ tracker.T_map_lidar)[:3, 3]))
+        errors.append(np.linalg.norm((se3.inverse(T) @ tracker.filter.T_map_lidar)[:3, 3]))
     return fixes, np.array(errors), tracker
 
 
@@ -106,7 +106,7 @@ def test_a_wrong_map_gives_no_fix_and_odometry_goes_on(mine: WallPoints, flown: 
     assert not any(fix.trusted for fix in fixes[8:])
     assert all(fix.reason for fix in fixes if not fix.trusted)
     # nothing but odometry: the pose is its chain, the covariance grows
-    assert np.trace(tracker.covariance[3:, 3:]) > np.trace(WIDE[3:, 3:])
+    assert np.trace(tracker.filter.covariance[3:, 3:]) > np.trace(WIDE[3:, 3:])
     assert np.isfinite(errors).all()
 
 

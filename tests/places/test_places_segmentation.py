@@ -4,64 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from plan_scenes import Plan
+from plan_scenes import drawn, mapped, walls_of
 
 from mineloc.config import IntersectionsConfig
-from mineloc.data import Intersection, MapCloud
+from mineloc.data import Intersection
 from mineloc.places.database import database_of
 from mineloc.places.segmentation import intersections_of, kind_of
 from mineloc.places.sheet_grid import sheet_grid
-from mineloc.roadways.centre_lines import centre_lines
-from mineloc.roadways.mapped import MappedRoadway, MappedRoadways
-from mineloc.roadways.sheet import Sheet, link
 
 CONFIG = IntersectionsConfig()
-CELL_M = CONFIG.cell_m
-
-
-def sheet_of(is_open: np.ndarray, origin_m: np.ndarray) -> Sheet:
-    """Cells of one level, 3 m high."""
-    row, column = np.nonzero(is_open)
-    floor = np.zeros(len(row))
-    links = link(column, row, floor, floor + 3.0, 1.2)
-    return Sheet(CELL_M, origin_m, column, row, floor, floor + 3.0, links)
-
-
-def drawn() -> Sheet:
-    """A T at the origin and a crossing 30 m east of it."""
-    axis = np.arange(-25, 60, CELL_M)
-    x, y = np.meshgrid(axis, axis)
-    places = np.column_stack([x.ravel(), y.ravel()])
-    one = Plan((0, 90, 180), length_m=22.0).is_open(places)
-    other = Plan((0, 90, 180, 270), length_m=22.0, width_m=3.4).is_open(places - [30.0, 0.0])
-    return sheet_of((one | other).reshape(x.shape), np.array([-25.0, -25.0]))
-
-
-def walls_of(sheet: Sheet) -> MapCloud:
-    edge = (sheet.links < 0).any(axis=1)
-    foot = sheet.floor_points_m(np.flatnonzero(edge))
-    points = np.concatenate([foot + np.array([0, 0, z]) for z in np.arange(0.1, 3, 0.3)])
-    n = len(points)
-    return MapCloud(
-        origin_m=np.zeros(3),
-        points_m=points.astype(np.float32),
-        normals=np.tile(np.array([0, 0, 1], np.float32), (n, 1)),
-        counts=np.full(n, 9, np.int32),
-        visits=np.full(n, 2, np.int32),
-        thickness_m=np.full(n, 0.01, np.float32),
-        near_m=np.full(n, 2.0, np.float32),
-        surface=np.full(n, 2, np.uint8),
-        voxel_m=0.2,
-    )
-
-
-def mapped(sheet: Sheet) -> MappedRoadways:
-    graph = centre_lines(sheet, rooms_overlap=True)
-    roads = tuple(
-        MappedRoadway(road.a, road.b, road.line_m, *(np.full(len(road.line_m), v) for v in (2.0, 2.0, 3.0)))
-        for road in graph.roadways
-    )
-    return MappedRoadways(graph.nodes_m, roads, 1.2)
 
 
 @pytest.fixture(scope="module")

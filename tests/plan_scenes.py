@@ -6,9 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mineloc.data import F32, F64
+from mineloc.data import F32, F64, MapCloud
+from mineloc.roadways.centre_lines import centre_lines
+from mineloc.roadways.mapped import MappedRoadway, MappedRoadways
+from mineloc.roadways.sheet import Sheet, link
 
 HEIGHT_M, SENSOR_M = 3.0, 1.5
+CELL_M = 0.2
 
 
 class Plan:
@@ -53,3 +57,63 @@ class Plan:
             r = r[seen] + rng.normal(0, 0.02, int(seen.sum()))
             points.append(np.column_stack([r * np.cos(azimuth[seen]), r * np.sin(azimuth[seen]), r * rise]))
         return np.concatenate(points).astype(np.float32)
+
+
+class TwoIntersections(Plan):
+    """A T at the origin and a crossing 30 m east of it."""
+
+    def __init__(self) -> None:
+        self._one = Plan((0, 90, 180), length_m=22.0)
+        self._other = Plan((0, 90, 180, 270), length_m=22.0, width_m=3.4)
+
+    def is_open(self, places: F64) -> np.ndarray:
+        """(n,) of (n, 2) places."""
+        return self._one.is_open(places) | self._other.is_open(places - np.array([30.0, 0.0]))
+
+
+def sheet_of(is_open: np.ndarray, origin_m: np.ndarray) -> Sheet:
+    """Cells of one level, 3 m high."""
+    row, column = np.nonzero(is_open)
+    floor = np.zeros(len(row))
+    links = link(column, row, floor, floor + 3.0, 1.2)
+    return Sheet(CELL_M, origin_m, column, row, floor, floor + 3.0, links)
+
+
+def drawn() -> Sheet:
+    """The free space of `TwoIntersections`."""
+    axis = np.arange(-25, 60, CELL_M)
+    x, y = np.meshgrid(axis, axis)
+    places = np.column_stack([x.ravel(), y.ravel()])
+    return sheet_of(TwoIntersections().is_open(places).reshape(x.shape), np.array([-25.0, -25.0]))
+
+
+def walls_of(sheet: Sheet) -> MapCloud:
+    """The foot of the walls, drawn up."""
+    edge = (sheet.links < 0).any(axis=1)
+    foot = sheet.floor_points_m(np.flatnonzero(edge))
+    return cloud_of(np.concatenate([foot + np.array([0, 0, z]) for z in np.arange(0.1, 3, 0.3)]))
+
+
+def cloud_of(points: F64) -> MapCloud:
+    """A map of points alone."""
+    n = len(points)
+    return MapCloud(
+        origin_m=np.zeros(3),
+        points_m=points.astype(np.float32),
+        normals=np.tile(np.array([0, 0, 1], np.float32), (n, 1)),
+        counts=np.full(n, 9, np.int32),
+        visits=np.full(n, 2, np.int32),
+        thickness_m=np.full(n, 0.01, np.float32),
+        near_m=np.full(n, 2.0, np.float32),
+        surface=np.full(n, 2, np.uint8),
+        voxel_m=0.2,
+    )
+
+
+def mapped(sheet: Sheet) -> MappedRoadways:
+    graph = centre_lines(sheet, rooms_overlap=True)
+    roads = tuple(
+        MappedRoadway(road.a, road.b, road.line_m, *(np.full(len(road.line_m), v) for v in (2.0, 2.0, 3.0)))
+        for road in graph.roadways
+    )
+    return MappedRoadways(graph.nodes_m, roads, 1.2)

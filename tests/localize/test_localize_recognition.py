@@ -1,0 +1,106 @@
+"""Recognition in flight on two drawn intersections: what is seen, what is refused and at which step."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from plan_scenes import SENSOR_M, Plan, TwoIntersections, cloud_of, drawn, mapped
+
+from mineloc import se3
+from mineloc.config import Config
+from mineloc.data import F64, Intersection, IntersectionDatabase, Keyframe, MapCloud
+from mineloc.localize.recognition import Recognizer
+from mineloc.places.database import database_of
+from mineloc.places.segmentation import intersections_of
+
+CONFIG = Config()
+
+
+def anywhere(known: Intersection, T_map_lidar: F64) -> bool:
+    return bool(len(known.name) and T_map_lidar.shape)
+
+
+def nowhere(known: Intersection, T_map_lidar: F64) -> bool:
+    return not anywhere(known, T_map_lidar)
+
+
+def surveyed() -> MapCloud:
+    """What a mapping flight sees along all roadways: a point a cell of 0.1 m."""
+    rng = np.random.default_rng(0)
+    plan = TwoIntersections()
+    ways = [(x, 0.0) for x in np.arange(-18, 48, 1.5)] + [(0.0, y) for y in np.arange(1.5, 18, 1.5)]
+    ways += [(30.0, y) for y in np.arange(-18, 18, 1.5)]
+    parts = [plan.sweep(np.array(at), 0.0, rng) + np.array([*at, SENSOR_M]) for at in ways]
+    points = np.concatenate(parts)
+    points = points[np.unique(np.floor(points * 10), axis=0, return_index=True)[1]]
+    return cloud_of(points)
+
+
+@pytest.fixture(scope="module")
+def database() -> IntersectionDatabase:
+    sheet = drawn()
+    found = intersections_of(sheet, surveyed(), mapped(sheet), CONFIG.intersections)
+    facts = {"grid_origin_m": np.zeros(3), "is_grid": False, "map_sha256": ""}
+    return database_of(found, CONFIG.intersections, **facts)
+
+
+def flown(plan: Plan, start_m: float, end_m: float) -> tuple[list[Keyframe], F64]:
+    """Keyframes a metre apart along x, odometry in another frame than the map; and their true poses."""
+    rng = np.random.default_rng(3)
+    step = 1.0 if end_m > start_m else -1.0
+    heading = 0.0 if step > 0 else np.pi
+    truth = np.array([se3.exp(np.array([0, 0, heading, 0, 0, 0]))] * int(abs(end_m - start_m)))
+    truth[:, 0, 3] = start_m + step * np.arange(len(truth))
+    truth[:, 2, 3] = SENSOR_M
+    T_odom_map = se3.exp(np.array([0, 0, 1.1, 40.0, -7.0, 3.0]))
+    return [Keyframe(k, k, T_odom_map @ T, plan.sweep(T[:2, 3], heading, rng)) for k, T in enumerate(truth)], truth
+
+
+def test_both_are_recognised_from_either_side_without_knowing_where(database: IntersectionDatabase) -> None:
+    for start_m, end_m in ((-14.0, 42.0), (44.0, -12.0)):
+        recognizer = Recognizer(CONFIG, database)
+        keyframes, truth = flown(TwoIntersections(), start_m, end_m)
+        fixes = [recognizer.follow(keyframe, anywhere) for keyframe in keyframes]
+        trusted = [fix for fix in fixes if fix.trusted]
+        assert {fix.target for fix in trusted} == {"T 0", "X 1"}
+        for fix in trusted:
+            error = se3.inverse(truth[fix.keyframe]) @ fix.T_map_lidar
+            # the X looks the same from four sides, the T does not
+            if fix.target == "T 0":
+                assert np.linalg.norm(error[:2, 3]) < 0.3
+                assert np.degrees(se3.angle_rad(error)) < 3
+        assert all(fix.reason for fix in fixes if not fix.trusted)
+
+
+def test_what_is_known_of_the_position_decides_between_sides(database: IntersectionDatabase) -> None:
+    recognizer = Recognizer(CONFIG, database)
+    keyframes, truth = flown(TwoIntersections(), 18.0, 42.0)
+    count = 0
+    for keyframe, T in zip(keyframes, truth, strict=True):
+
+        def near(known: Intersection, T_map_lidar: F64, T: F64 = T) -> bool:
+            assert known.name in {"T 0", "X 1"}
+            away = se3.inverse(T) @ T_map_lidar
+            return bool(np.linalg.norm(away[:3, 3]) < 2.0 and se3.angle_rad(away) < 0.3)
+
+        fix = recognizer.follow(keyframe, near)
+        if fix.trusted:
+            count += 1
+            assert np.linalg.norm((se3.inverse(T) @ fix.T_map_lidar)[:2, 3]) < 0.3
+    assert count >= 3
+
+
+@pytest.mark.parametrize("bearings", [(0, 180), (0, 55, 180), (0, 72, 144, 216, 288)], ids=["straight", "Y", "five"])
+def test_another_mine_is_refused_with_the_step(database: IntersectionDatabase, bearings: tuple[float, ...]) -> None:
+    recognizer = Recognizer(CONFIG, database)
+    keyframes, _ = flown(Plan(bearings), -10.0, 8.0)
+    fixes = [recognizer.follow(keyframe, anywhere) for keyframe in keyframes]
+    assert not any(fix.trusted for fix in fixes)
+    assert all("(step " in fix.reason for fix in fixes)
+
+
+def test_a_position_that_excludes_all_is_a_reason(database: IntersectionDatabase) -> None:
+    recognizer = Recognizer(CONFIG, database)
+    keyframes, _ = flown(TwoIntersections(), -14.0, 10.0)
+    fixes = [recognizer.follow(keyframe, nowhere) for keyframe in keyframes]
+    assert {fix.reason.split("(")[-1] for fix in fixes} <= {"step 2)", "step 4)"}
