@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -17,6 +16,8 @@ _BEARINGS = 180
 _WIDEST = 3.2
 """An arc wider than so many clearances is no branch but a hall."""
 _CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.bool_)
+_LEAST = 3
+"""Branches that make a junction."""
 _AGAIN_M = 0.4
 """The rings are laid around the invariant point once more if it lies so far from the clearance maximum."""
 
@@ -129,7 +130,7 @@ def _junction_at(
     row, column = grid.cells_of(place[None])
     room = float(clearance[row[0], column[0]])
     branches = branches_around(grid, free, place, room, config)
-    if len(branches) < 3:
+    if len(branches) < _LEAST:
         return None
     point, covariance = invariant_point(branches, place, config)
     if np.linalg.norm(point - place) > _AGAIN_M:
@@ -152,8 +153,12 @@ def branches_around(
         centre_m: (2,) of the rings.
         clearance_m: free distance there; the rings lie beyond it.
     """
-    rings = [_arcs(grid, free, centre_m, clearance_m + beyond, config) for beyond in config.ring_m]
     widest = _WIDEST * clearance_m + 1.0
+    outer = _arcs(grid, free, centre_m, clearance_m + config.ring_m[-1], config)
+    if sum(arc.chord_m < widest for arc in outer) < _LEAST:
+        return ()  # a branch is an arc of the outermost ring: the others need not be looked at
+    rings = [_arcs(grid, free, centre_m, clearance_m + beyond, config) for beyond in config.ring_m[:-1]]
+    rings.append(outer)
     branches = [
         _branch(chain, centre_m)
         for arc in rings[-1]
@@ -222,12 +227,15 @@ def _arcs(grid: FreeGrid, free: Bool, centre_m: F64, radius_m: float, config: In
 
 def _closed_ring(filled: Bool, gap: int) -> Bool:
     """Gaps of at most `gap` bins between filled ones are filled: cells are coarser than bearings near the centre."""
-    out = filled.copy()
     where = np.flatnonzero(filled)
-    for a, b in pairwise([*where, *(where[:1] + len(filled))]):
-        if b - a <= gap + 1:
-            out[np.arange(a, b) % len(filled)] = True
-    return out
+    if not len(where):
+        return filled.copy()
+    n = len(filled)
+    last = np.maximum.accumulate(np.where(filled, np.arange(n), -1))
+    following = np.minimum.accumulate(np.where(filled, np.arange(n), 2 * n)[::-1])[::-1]
+    last = np.where(last < 0, where[-1] - n, last)
+    following = np.where(following == 2 * n, where[0] + n, following)
+    return following - last <= gap + 1
 
 
 def _runs(filled: Bool) -> list[tuple[int, int]]:
