@@ -98,6 +98,16 @@ def read_database(path: Path) -> IntersectionDatabase:
         ) from error
 
 
+def is_database(path: Path) -> bool:
+    """Whether a file says that it is a database of intersections, of any version; False where it cannot be read."""
+    try:
+        with path.open("rb") as stream:
+            names = [one.name for one in make_reader(stream).iter_metadata()]
+    except (OSError, McapError, ValueError, EOFError, struct.error):
+        return False
+    return any(name.startswith("mineloc.intersections/") for name in names)
+
+
 def _facts(database: IntersectionDatabase) -> dict[str, Any]:
     return {
         "count": len(database),

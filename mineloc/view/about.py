@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import cast
 
-from mineloc.data import F64, FlightInfo
+from mineloc.data import F64, FlightInfo, IntersectionDatabase
 from mineloc.stages.map_folder import MapFolder
 from mineloc.view.scene import Scene
 
@@ -20,6 +21,11 @@ error is larger. Yellow: current sweep. Green: keyframes; their edges are vermil
 _MAP_LEGEND = """
 Brown: floor. Grey: walls. Dark: roof (hide it to look inside). Yellow: roadways; orange: intersections; white: ends.
 Blue: the flight. Green: loop closures.
+"""
+
+_DATABASE_LEGEND = """
+Orange: invariant points. Yellow: branches. Green: walls of the contour. Blue: neighbours, as the crow
+flies. Grey: clouds.
 """
 
 
@@ -78,6 +84,28 @@ def about_map(survey: MapFolder, origin_m: F64) -> str:
         if summary is not None:
             lines.append(f"| {role} points | {summary['count']}, RMSE {summary['rmse_3d_m']:.3f} m |")
     lines += ["", _MAP_LEGEND.strip().replace("\n", " ")]
+    return "\n".join([*lines, *_subtracted(origin_m)])
+
+
+def about_database(known: IntersectionDatabase, origin_m: F64) -> str:
+    """Markdown of a database of intersections: a row each, in the order of the similarity pictures."""
+    twins = ", ".join(f"{a} and {b}" for a, b in known.twins) or "none"
+    lines = [
+        "# Intersections",
+        "",
+        f"{len(known)} of map {escaped(known.map_sha256[:12])}. Contours more alike than {known.contour_threshold:.2f} "
+        f"may be one place. Twins: {twins}.",
+        "",
+        "| row | id | name | kind | branches (°) | neighbours | quality |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for row, one in enumerate(known.intersections):
+        branches = " ".join(f"{math.degrees(b):.0f}" for b in one.contour.branches_rad)
+        ways = ", ".join(f"{other} ({length_m:.0f} m)" for other, length_m in one.neighbours)
+        lines.append(
+            f"| {row} | {one.id} | {escaped(one.name)} | {one.kind} | {branches} | {ways} | {one.quality:.0%} |"
+        )
+    lines += ["", _DATABASE_LEGEND.strip().replace("\n", " ")]
     return "\n".join([*lines, *_subtracted(origin_m)])
 
 

@@ -88,6 +88,27 @@ def map_layout(low_m: F64, high_m: F64) -> rrb.Blueprint:
     )
 
 
+def database_layout(low_m: F64, high_m: F64) -> rrb.Blueprint:
+    """The layout of a database of intersections: the mine, and beside it how alike they are and the facts.
+
+    Args:
+        low_m, high_m: (3,) corners of what the eye shall take in, local origin already subtracted.
+    """
+    mine = rrb.Spatial3DView(origin="map", name="Intersections", eye_controls=_eye(low_m, high_m), line_grid=False)
+    alike = rrb.Horizontal(
+        rrb.Spatial2DView(origin="similarity/contours", name="Contours alike (PWCV)"),
+        rrb.Spatial2DView(origin="similarity/matrices", name="Matrices alike (CWC)"),
+    )
+    about = rrb.TextDocumentView(origin="about", name="About")
+    return rrb.Blueprint(
+        rrb.Horizontal(mine, rrb.Vertical(alike, about, row_shares=[2, 3]), column_shares=[3, 2]),
+        rrb.TimePanel(state=rrb.PanelState.Hidden),
+        rrb.SelectionPanel(state=rrb.PanelState.Hidden),
+        rrb.BlueprintPanel(state=rrb.PanelState.Collapsed),
+        auto_views=False,
+    )
+
+
 def _eye(low_m: F64, high_m: F64) -> rrb.EyeControls3D:
     """From the south, steep enough that roadways do not hide each other, near enough to fill the view."""
     width, depth, height = np.maximum(high_m - low_m, 1.0).tolist()

@@ -79,6 +79,18 @@ class RunRecorder:
         radius = rr.Radius.ui_points(width_px / 2)
         self._stream.log(entity, rr.LineStrips3D(strips, colors=np.asarray(colors), radii=radius), static=True)
 
+    def names(self, entity: str, points_map: F64, texts: Sequence[str], *, color: Rgb) -> None:
+        """A text at each of (n, 3) map points, always there."""
+        points = rr.Points3D(
+            self._local(points_map), labels=list(texts), colors=np.asarray(color), radii=0.3, show_labels=True
+        )
+        self._stream.log(entity, points, static=True)
+
+    def shares(self, entity: str, values: F64) -> None:
+        """(rows, columns) numbers from 0 to 1 as a picture; the value shows under the pointer."""
+        picture = rr.DepthImage(values.astype(np.float32), meter=1.0, colormap="viridis", depth_range=[0.0, 1.0])
+        self._stream.log(entity, picture, static=True)
+
     def moving(self, entity: str, stamps_ns: I64, poses: F64, *, axis_m: float) -> None:
         """A frame that moves: `T_map_entity` (n, 4, 4) at its times, drawn as axes."""
         position, xyzw = se3.to_xyzw(poses)

@@ -10,9 +10,11 @@ from rerun.chunk import RrdReader
 
 from mineloc.config import Config
 from mineloc.errors import FormatError
+from mineloc.io.intersection_database import is_database
 from mineloc.progress import Progress, quiet
 from mineloc.stages.map_folder import MapFolder
 from mineloc.view.flight import record_flight
+from mineloc.view.intersections import record_database
 from mineloc.view.recorder import TIMELINE
 from mineloc.view.run import record_run
 from mineloc.view.survey_map import record_map
@@ -32,7 +34,8 @@ def show(
     """Record and show; a window opens only when neither `save` nor `picture` is wanted.
 
     Args:
-        what: a run folder, a map folder, a canonical flight (.mcap), or a recording (.rrd).
+        what: a run folder, a map folder, a canonical flight or a database of intersections (.mcap), or a recording
+            (.rrd).
         flight: the flight of a run, for its sweeps.
         save: where to keep the recording.
         picture: where to write a picture of it, half way through the flight.
@@ -65,6 +68,8 @@ def _recording(what: Path, flight: Path | None, out: Path, overwrite: bool, conf
         raise FormatError(what, "no such file or folder", todo="check the path")
     if flight is not None:
         raise FormatError(what, "is no run folder", expected="a run folder with --flight", todo="leave out --flight")
+    if what.suffix == ".mcap" and is_database(what):
+        return record_database(what, out, config=config.view, overwrite=overwrite)
     if what.suffix == ".mcap":
         return record_flight(what, out, config=config, overwrite=overwrite, progress=progress)
     if what.suffix == ".rrd":
