@@ -14,11 +14,12 @@ from mineloc import se3
 from mineloc.config import KeyframeConfig, OdometryConfig
 from mineloc.data import F64, Calibration, Degeneracy, ImuSamples, Keyframe, OdometryStep, RelativePose, Sweep
 from mineloc.errors import FlightError
+from mineloc.odometry.contrast import contrast
 from mineloc.odometry.information import EdgeNoise, degeneracy_of, edge_information, weakest_direction
 from mineloc.odometry.keyframes import KeyframeSelector
 from mineloc.odometry.model_choice import ModelChoice
 from mineloc.odometry.motion import BodyPath, MotionModel
-from mineloc.odometry.registration import Linearised, Thinned, Weighting, contrast, linearise
+from mineloc.odometry.registration import Linearised, Thinned, Weighting, linearise
 from mineloc.odometry.voxel_map import VoxelMap, insert_into_both
 from mineloc.sweep.deskew import moved_by_twist, transform_between_knots
 from mineloc.sweep.voxel_grid import VoxelMeans, voxel_means

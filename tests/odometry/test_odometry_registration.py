@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from mineloc import se3
 from mineloc.config import OdometryConfig
 from mineloc.data import F64
+from mineloc.odometry.contrast import contrast
 from mineloc.odometry.motion import add_to_pose
-from mineloc.odometry.registration import Linearised, Thinned, Weighting, contrast, linearise, linearise_plainly
+from mineloc.odometry.registration import Linearised, Thinned, Weighting, linearise, linearise_plainly
 from mineloc.odometry.voxel_map import VoxelMap
 
 DEFAULT = Weighting.of(OdometryConfig())
