@@ -37,6 +37,7 @@ class IntersectionsConfig(Section):
     threshold_floor: float = Field(default=0.5, ge=0, le=1, description="least contour similarity of a candidate")
     threshold_quantile: float = Field(default=0.99, ge=0, le=1, description="of pairs of different intersections")
     twin_matrix: float = Field(default=0.6, ge=0, le=1, description="matrix similarity from which on two are twins")
+    branch_match_deg: float = Field(default=20.0, gt=0, description="two bearings so near are those of one branch")
     recognise_m: float = Field(default=7.0, gt=0, description="an intersection is recognised from at most so far away")
     peak_drop: float = Field(default=0.15, ge=0, le=1, description="turns so much less alike are tried too")
     matrix_margin: float = Field(default=0.05, ge=0, le=1, description="by which a matrix must fit better")

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from mineloc.config import PriorMapConfig
-from mineloc.data import F64, Fix, Intersection, Keyframe, RelativePose
+from mineloc.data import F64, Fix, Keyframe, RelativePose
 from mineloc.localize.pose_filter import PoseFilter
 from mineloc.localize.prior_map import PriorMap
 from mineloc.localize.recognition import Recognizer
@@ -57,12 +57,11 @@ class MapTracker:
         reason = found.reason
         if not reason and sigmas > c.max_moved_sigmas:
             reason = f"{sigmas:.1f} sigmas from the prediction, at most {c.max_moved_sigmas} allowed"
-        covariance = np.asarray(np.linalg.inv(found.information), dtype=np.float64)
         fix = Fix(
             stamp_ns=keyframe.stamp_ns,
             keyframe=keyframe.index,
             T_map_lidar=found.T_map_lidar,
-            covariance=0.5 * (covariance + covariance.T),
+            covariance=found.covariance,
             trusted=not reason,
             reason=reason,
             target="map",
@@ -108,9 +107,8 @@ class IntersectionTracker:
         self.filter.correct(fix)
         return fix
 
-    def _is_possible(self, known: Intersection, T_map_lidar: F64) -> bool:
+    def _is_possible(self, T_map_lidar: F64) -> bool:
         """Before registration: an invariant point is known to some decimetres, its turn to some degrees."""
-        del known
         c = self._config
         sigmas = self.filter.sigmas_away(T_map_lidar, floor_m=c.seen_floor_m, floor_deg=c.seen_floor_deg)
         return sigmas <= c.max_moved_sigmas

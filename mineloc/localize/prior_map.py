@@ -39,6 +39,12 @@ class MapRegistration:
     moved_rad: float
     reason: str
 
+    @property
+    def covariance(self) -> F64:
+        """(6, 6) inverse of the information."""
+        covariance = np.asarray(np.linalg.inv(self.information), dtype=np.float64)
+        return 0.5 * (covariance + covariance.T)
+
 
 class PriorMap:
     """The map of a mine as patches at two sizes.

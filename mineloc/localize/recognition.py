@@ -18,8 +18,8 @@ from mineloc.places.contour_matrix import contour_matrix, matrix_likeness
 from mineloc.places.free_grid import FreeGrid, free_grid
 from mineloc.places.wall_contour import branches_fit, likeness_peaks, wall_contour
 
-IsPossible = Callable[[Intersection, F64], bool]
-"""Whether an intersection may be seen from a pose (4, 4) `T_map_lidar`; what is known of the position decides."""
+IsPossible = Callable[[F64], bool]
+"""Whether the drone may be at a pose (4, 4) `T_map_lidar`: what is known of its position decides."""
 
 
 _FLOOR_M = 2.5
@@ -84,6 +84,7 @@ class Recognizer:
         if self._same < self._config.same_needed:  # step 8
             reason = f"{self._same} keyframes agree, at least {self._config.same_needed} needed (step 8)"
             return self._refused(keyframe, reason, scores, target=best.known)
+        self._same = 0
         return self._verified(best, keyframe, here, scores)  # step 9
 
     def _prepared(self, keyframe: Keyframe) -> _Seen:
@@ -117,7 +118,7 @@ class Recognizer:
         """Intersections whose contour is like this one and that may be here, the most alike first."""
         floor_m = self._floor_under(junction, here)
         T_level_lidar = se3.inverse(here.T_odom_level) @ keyframe.T_odom_lidar
-        within = np.radians(self._config.max_turn_deg)
+        within = np.radians(self._config.branch_match_deg)
         found: list[_Candidate] = []
         likest = 0.0
         for known in self._database.intersections:
@@ -126,7 +127,7 @@ class Recognizer:
                     continue
                 T = se3.exp(np.array([0.0, 0.0, yaw, 0.0, 0.0, 0.0]))
                 T[:3, 3] = known.point_map - T[:3, :3] @ np.array([*junction.point_m, floor_m])
-                if not is_possible(known, T @ T_level_lidar):
+                if not is_possible(T @ T_level_lidar):
                     continue
                 likest = max(likest, similarity)
                 if similarity >= self._database.contour_threshold:
@@ -163,12 +164,11 @@ class Recognizer:
         found = self._map_of(best.known).register(points_lidar, expected, np.diag([turn**2] * 3 + [shift**2] * 3))
         scores |= {"inlier_ratio": found.inlier_ratio, "residual_m": found.residual_m, "moved_m": found.moved_m}
         reason = self._doubt(found)
-        covariance = np.asarray(np.linalg.inv(found.information), dtype=np.float64)
         return Fix(
             stamp_ns=keyframe.stamp_ns,
             keyframe=keyframe.index,
             T_map_lidar=found.T_map_lidar,
-            covariance=0.5 * (covariance + covariance.T),
+            covariance=found.covariance,
             trusted=not reason,
             reason=reason,
             target=best.known.name,

@@ -28,7 +28,7 @@ def database_of(
 
     Args:
         intersections: by rising id.
-        config: `threshold_floor`, `threshold_quantile`, `twin_matrix`, `max_turn_deg`.
+        config: `threshold_floor`, `threshold_quantile`, `twin_matrix`, `branch_match_deg`.
         grid_origin_m, is_grid, map_sha256: of the map.
     """
     contour, matrix = similarities(intersections, config)
@@ -57,7 +57,7 @@ def similarities(intersections: Sequence[Intersection], config: IntersectionsCon
     """(k, k) of contours and of matrices at the best turn; 0 where the branches do not fit at that turn."""
     k = len(intersections)
     contour, matrix = np.eye(k), np.eye(k)
-    within = np.radians(config.max_turn_deg)
+    within = np.radians(config.branch_match_deg)
     for i, a in enumerate(intersections):
         for j in range(i + 1, k):
             b = intersections[j]
