@@ -12,11 +12,12 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from mineloc.config import IntersectionsConfig
-from mineloc.data import F64, Intersection, IntersectionKind, MapCloud
+from mineloc.data import F64, I64, Intersection, IntersectionKind, MapCloud, WallContour
 from mineloc.places.branches import Junction, find_junctions
 from mineloc.places.contour_matrix import contour_matrix
 from mineloc.places.free_grid import FreeGrid
 from mineloc.places.sheet_grid import sheet_grid
+from mineloc.places.virtual_views import self_recognition
 from mineloc.places.wall_contour import wall_contour
 from mineloc.roadways.mapped import MappedRoadways
 from mineloc.roadways.sheet import Sheet
@@ -64,44 +65,52 @@ def intersections_of(
     neighbours = neighbours_along([segment.point_map for segment in segments], roadways)
     points = cloud.points_map
     tree = KDTree(points[:, :2])
+    contours = [
+        wall_contour(segment.grid, segment.junction.point_m, segment.junction.branches_rad, config)
+        for segment in segments
+    ]
     found: list[Intersection] = []
     for id, (segment, at_node) in enumerate(zip(segments, sorted(is_node, reverse=True), strict=True)):
         near = np.array(sorted(tree.query_ball_point(segment.point_map[:2], config.cloud_radius_m)), dtype=np.int64)
         level = np.abs(points[near, 2] - segment.point_map[2]) < config.cloud_height_m
         near = near[level]
-        found.append(_described(id, segment, cloud, near, neighbours[id], config, is_bay=not at_node))
+        quality = self_recognition(segment.grid, segment.junction.point_m, id, contours, config)
+        found.append(
+            _described(id, segment, contours[id], cloud, near, neighbours[id], quality, config, is_bay=not at_node)
+        )
     return found
 
 
 def _described(
     id: int,
     segment: Segment,
+    contour: WallContour,
     cloud: MapCloud,
-    near: np.ndarray,
+    near: I64,
     neighbours: tuple[tuple[int, float], ...],
+    quality: float,
     config: IntersectionsConfig,
     *,
     is_bay: bool,
 ) -> Intersection:
     point = segment.point_map
     around = (cloud.points_map[near] - point).astype(np.float32)
-    branches = segment.junction.branches_rad
     covariance = np.zeros((3, 3))
     covariance[:2, :2] = segment.junction.covariance_m2
     covariance[2, 2] = config.cell_m**2
-    kind = "bay" if is_bay else kind_of(branches)
+    kind = "bay" if is_bay else kind_of(contour.branches_rad)
     return Intersection(
         id=id,
         name=f"{kind} {id}",
         kind=kind,
         point_map=point,
         covariance_m2=covariance,
-        contour=wall_contour(segment.grid, segment.junction.point_m, branches, config),
+        contour=contour,
         matrix=contour_matrix(around, np.zeros(2), 0.0, config),
         points_m=around,
         normals=cloud.normals[near],
         neighbours=neighbours,
-        quality=1.0,
+        quality=quality,
     )
 
 

@@ -11,6 +11,7 @@ from mineloc.data import Intersection
 from mineloc.places.database import database_of
 from mineloc.places.segmentation import intersections_of, kind_of
 from mineloc.places.sheet_grid import sheet_grid
+from mineloc.places.virtual_views import self_recognition, visible
 
 CONFIG = IntersectionsConfig()
 
@@ -27,6 +28,27 @@ def test_both_are_found_where_they_are_with_their_kinds(found: list[Intersection
     assert found[1].point_map == pytest.approx([30, 0, 0], abs=0.5)
     assert np.degrees(found[0].contour.branches_rad) == pytest.approx([0, 90, 180], abs=10) or found[0].degree == 3
     assert found[1].degree == 4
+
+
+def test_both_recognise_themselves_from_most_views_and_a_double_is_told(found: list[Intersection]) -> None:
+    assert all(one.quality >= 0.6 for one in found)
+    sheet = drawn()
+    start = int(np.hypot(*(sheet.floor_points_m(np.arange(len(sheet)))[:, :2] - [30.0, 0.0]).T).argmin())
+    grid = sheet_grid(sheet, start, np.array([30.0, 0.0, 0.0]), CONFIG)
+    crossing = found[1].contour
+    assert self_recognition(grid, np.zeros(2), 1, [crossing, crossing], CONFIG) == 0.0  # its double comes first
+    assert self_recognition(grid, np.array([9.0, 0.0]), 0, [crossing], CONFIG) == 0.0  # there is none
+
+
+def test_a_view_ends_at_the_first_wall() -> None:
+    sheet = drawn()
+    start = int(np.hypot(*sheet.floor_points_m(np.arange(len(sheet)))[:, :2].T).argmin())
+    grid = sheet_grid(sheet, start, np.zeros(3), CONFIG)
+    seen = visible(grid, np.array([[-10.0, 0.0]]), reach_m=20.0)
+    rows, columns = grid.cells_of(np.array([[-10.0, 0.0], [5.0, 0.0], [0.0, 10.0], [-14.0, 0.0]]))
+    assert seen.sight[rows, columns].tolist() == [2, 2, 0, 2]
+    assert set(np.unique(seen.sight[seen.sight != grid.sight])) == {0}
+    assert not visible(grid, np.array([[0.0, -8.0]]), reach_m=20.0).sight.any()
 
 
 def test_they_are_neighbours_by_the_way_between(found: list[Intersection]) -> None:
