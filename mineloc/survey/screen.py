@@ -18,7 +18,7 @@ FIGURES = {
     "ape_rmse_m": "RMSE m",
     "ape_max_m": "max m",
     "ape_rmse_deg": "RMSE °",
-    "drift_percent": "drift %",
+    "kitti_percent": "KITTI %",
 }
 _MARKS = {"done": ("[green]✓[/]", ""), "known": ("[cyan]=[/]", " known"), "failed": ("[red]✗[/]", "")}
 

@@ -16,13 +16,13 @@ KEYS = (
     "ape_rmse_m",
     "ape_max_m",
     "ape_rmse_deg",
-    "drift_percent",
+    "kitti_percent",
     "alignment",
 )
 
 
 def summary(plan: Plan, *, flight: str | None = None) -> list[dict[str, Any]]:
-    """One row a run and trajectory, keys as in `KEYS`; None is unknown (no reference, too short for drift).
+    """One row a run and trajectory, keys as in `KEYS`; None is unknown (no reference, too short for KITTI).
 
     Drift is KITTI's: translation error over sub-trajectories of 100 m and more, percent of their length.
     """
@@ -47,7 +47,7 @@ def _figures(one: dict[str, Any]) -> dict[str, Any]:
         "ape_rmse_m": _rounded(ape["translation_m"]["rmse"], 4),
         "ape_max_m": _rounded(ape["translation_m"]["max"], 4),
         "ape_rmse_deg": _rounded(ape["rotation_deg"]["rmse"], 4),
-        "drift_percent": _rounded(one["segments"]["percent"], 3),
+        "kitti_percent": _rounded(one["segments"]["percent"], 3),
         "alignment": alignment,
     }
 
