@@ -152,17 +152,22 @@ def reconstruct(
 
 @app.command()
 def database(
-    prior_map: Annotated[Path, typer.Argument(metavar="MAP", help="A map folder (of reconstruct).")],
+    source: Annotated[Path, typer.Argument(metavar="MAP", help="A map folder; with --names a database.")],
     out: Annotated[Path, typer.Option("--out", help="The database to write (.mcap).")],
+    names: Annotated[Path | None, typer.Option("--names", help="Its CSV with edited names and kinds.")] = None,
+    csv: Annotated[Path | None, typer.Option("--csv", help="Also write a table.")] = None,
+    geojson: Annotated[Path | None, typer.Option("--geojson", help="Also write points and ways.")] = None,
     as_json: JsonOption = False,
     config: ConfigOption = None,
     overrides: SetOption = None,
 ) -> None:
     """The intersections of a map, found and described. E.g. database map/ --out intersections.mcap."""
     from mineloc.config import load_config
-    from mineloc.stages.database import database as run_stage
+    from mineloc.stages import database as stage
 
-    result = run_stage(prior_map, out, config=load_config(config, overrides or ()))
+    settings = load_config(config, overrides or ())
+    result = stage.rename(source, names, out) if names else stage.database(source, out, config=settings)
+    stage.export(out, csv=csv, geojson=geojson)
     if as_json:
         sys.stdout.write(json.dumps(result.to_dict(), indent=1) + "\n")
         return

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 
 from mineloc.config import Config
+from mineloc.data import IntersectionDatabase
 from mineloc.errors import MapError
-from mineloc.io.intersection_database import write_database
+from mineloc.io.intersection_database import read_database, write_database
+from mineloc.io.intersection_files import read_names, with_names, write_csv, write_geojson
 from mineloc.mapping.free_space import free_sheet_of_map
 from mineloc.places.database import database_of
 from mineloc.places.segmentation import intersections_of
@@ -85,9 +87,45 @@ def database(prior_map: Path, out: Path, *, config: Config | None = None) -> Dat
         map_sha256=hashlib.sha256((survey.path / "manifest.json").read_bytes()).hexdigest(),
     )
     write_database(out, known)
+    return _result(out, known, started)
+
+
+def rename(source: Path, names: Path, out: Path) -> DatabaseResult:
+    """A database with the names and kinds that a person has put into its CSV.
+
+    Args:
+        source: the database as it is.
+        names: its CSV (of `export`), edited.
+        out: the database file to write.
+
+    Raises:
+        FormatError: no database, or a CSV that does not fit it.
+        OutputError: `out` exists or cannot be written.
+    """
+    started = perf_counter()
+    known = with_names(read_database(source), read_names(names), where=names)
+    write_database(out, known)
+    return _result(out, known, started)
+
+
+def export(source: Path, *, csv: Path | None = None, geojson: Path | None = None) -> None:
+    """A database for spreadsheets and for maps.
+
+    Raises:
+        FormatError: no database, or damaged.
+        OutputError: a file exists or cannot be written.
+    """
+    known = read_database(source)
+    if csv is not None:
+        write_csv(csv, known)
+    if geojson is not None:
+        write_geojson(geojson, known)
+
+
+def _result(out: Path, known: IntersectionDatabase, started: float) -> DatabaseResult:
     return DatabaseResult(
         out=out,
-        kinds=dict(Counter(one.kind for one in found)),
+        kinds=dict(Counter(one.kind for one in known.intersections)),
         threshold=known.contour_threshold,
         twins=known.twins,
         seconds=perf_counter() - started,

@@ -15,6 +15,7 @@ import polars as pl
 from mineloc import __version__, se3
 from mineloc.config import Config
 from mineloc.data import F64, Calibration, OdometryStep
+from mineloc.errors import ConfigError
 from mineloc.io.flight import FlightReader
 from mineloc.localize.localization import FlightData, Localization
 from mineloc.localize.method import Method, method_named
@@ -101,7 +102,7 @@ def localize(
         progress: told the sweeps that are done.
 
     Raises:
-        ConfigError: no such method, a method without its map, a map without a start.
+        ConfigError: no such method, a method without its map or with one it does not use, a map without a start.
         FormatError: `prior_map` is not a map folder, or `database` no database.
         IngestError: `flight` is not a canonical flight, or damaged.
         FlightError: it holds too little to localize.
@@ -109,7 +110,11 @@ def localize(
     """
     config = config or Config()
     chosen = method_named(method)
-    known = KnownMap.open(prior_map, database, config) if chosen.tracks is not None else None
+    if chosen.tracks is None and (prior_map is not None or database is not None):
+        raise ConfigError(
+            "--method", f"{method} uses no map", expected="no --map and no --database", todo="leave them out"
+        )
+    known = KnownMap.open(prior_map, database, config)
     with new_folder(out) as folder, FlightReader(flight) as reader:
 
         def counted(done: float, total: float | None, unit: str) -> None:

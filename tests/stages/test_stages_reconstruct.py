@@ -109,6 +109,10 @@ def test_tracking_without_map_or_start_is_refused_before_any_work(made, flight, 
                 flight[0], tmp_path / "run", method="map_tracking", prior_map=survey.path, config=in_the_map(None)
             ),
         ),
+        (
+            "uses no map",
+            lambda: localize(flight[0], tmp_path / "run", method="odometry", prior_map=survey.path, config=SMALL),
+        ),
         ("needs a map", lambda: reconstruct([flight[0]], tmp_path / "run", method="map_tracking", config=SMALL)),
     )
     for match, attempt in cases:
