@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from map_clouds import cloud_of
 
 from mineloc.data import F32, F64, MapCloud
 from mineloc.roadways.centre_lines import centre_lines
@@ -92,22 +93,6 @@ def walls_of(sheet: Sheet) -> MapCloud:
     edge = (sheet.links < 0).any(axis=1)
     foot = sheet.floor_points_m(np.flatnonzero(edge))
     return cloud_of(np.concatenate([foot + np.array([0, 0, z]) for z in np.arange(0.1, 3, 0.3)]))
-
-
-def cloud_of(points: F64) -> MapCloud:
-    """A map of points alone."""
-    n = len(points)
-    return MapCloud(
-        origin_m=np.zeros(3),
-        points_m=points.astype(np.float32),
-        normals=np.tile(np.array([0, 0, 1], np.float32), (n, 1)),
-        counts=np.full(n, 9, np.int32),
-        visits=np.full(n, 2, np.int32),
-        thickness_m=np.full(n, 0.01, np.float32),
-        near_m=np.full(n, 2.0, np.float32),
-        surface=np.full(n, 2, np.uint8),
-        voxel_m=0.2,
-    )
 
 
 def mapped(sheet: Sheet) -> MappedRoadways:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from map_clouds import cloud_of
 from rough_mine import Drifted, WallPoints, fly_along, ring, roadway_along
 
 from mineloc import se3
 from mineloc.config import OdometryConfig, PriorMapConfig
-from mineloc.data import F64, Fix, MapCloud
+from mineloc.data import F64, Fix
 from mineloc.localize.map_tracker import MapTracker
 from mineloc.localize.prior_map import PriorMap
 
@@ -16,23 +17,8 @@ ORIGIN = np.array([512_000.0, 4_398_000.0, 2_300.0])
 WIDE = np.diag([np.radians(0.5) ** 2] * 2 + [np.radians(3.0) ** 2] + [0.5**2] * 3)
 
 
-def cloud_of(points_m: F64) -> MapCloud:
-    n = len(points_m)
-    return MapCloud(
-        origin_m=ORIGIN,
-        points_m=points_m.astype(np.float32),
-        normals=np.tile(np.array([0, 0, 1], np.float32), (n, 1)),
-        counts=np.full(n, 9, np.int32),
-        visits=np.full(n, 2, np.int32),
-        thickness_m=np.full(n, 0.01, np.float32),
-        near_m=np.full(n, 2.0, np.float32),
-        surface=np.full(n, 2, np.uint8),
-        voxel_m=0.1,
-    )
-
-
 def prior_map(points_m: F64) -> PriorMap:
-    return PriorMap(cloud_of(points_m), PriorMapConfig(), OdometryConfig())
+    return PriorMap(cloud_of(points_m, origin_m=ORIGIN), PriorMapConfig(), OdometryConfig())
 
 
 def dense(mine: WallPoints) -> F64:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from plan_scenes import SENSOR_M, Plan, TwoIntersections, cloud_of, drawn, mapped
+from map_clouds import cloud_of
+from plan_scenes import SENSOR_M, Plan, TwoIntersections, drawn, mapped
 
 from mineloc import se3
 from mineloc.config import Config

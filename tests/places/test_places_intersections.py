@@ -67,16 +67,30 @@ def test_the_kernel_votes_as_plain_numpy_does(seed: int, keyframes: int, half_m:
     assert (fast.sight != plain.sight).mean() < 0.002
 
 
+def way_through(shape: str, start_m: float, end_m: float) -> list[F64]:
+    """From `start_m` (negative: on the last roadway) to `end_m` (on the first one), heading along the way."""
+    into, out = SHAPES[shape][-1], SHAPES[shape][0]
+    way: list[F64] = []
+    for s in np.arange(start_m, end_m + 0.5, 1.0):
+        bearing = into if s < 0 else out
+        x, y = abs(s) * np.cos(np.radians(bearing)), abs(s) * np.sin(np.radians(bearing))
+        way.append(at(x, y, bearing + 180.0 if s < 0 else bearing))
+    return way
+
+
 @pytest.mark.parametrize("shape", SHAPES)
 def test_an_intersection_flown_through_has_its_branches_and_its_point(shape: str) -> None:
     plan = Plan(SHAPES[shape])
-    found = [seen(plan, along_x(max(-8.0, x - 11), x), seed=int(x) + 5) for x in (-1.0, 0.0, 1.0, 2.0, 3.0)]
-    assert sum(len(one) >= 1 for one in found) >= 4
-    points, counts = [], []
-    for x, junctions in zip((-1.0, 0.0, 1.0, 2.0, 3.0), found, strict=True):
-        near = [one for one in junctions if np.linalg.norm(one.point_m + np.array([x, 0])) < 2.5]
-        points += [one.point_m + np.array([x, 0]) for one in near[:1]]
-        counts += [len(one.branches) for one in near[:1]]
+    points, counts, none = [], [], 0
+    for seed, end_m in enumerate((-1.0, 0.0, 1.0, 2.0, 3.0)):
+        way = way_through(shape, -8.0, end_m)
+        assert plan.is_open(np.array([T[:2, 3] for T in way])).all()
+        places = [(one, se3.apply(way[-1], [[*one.point_m, 0.0]])[0, :2]) for one in seen(plan, way, seed)]
+        near = [(one, place) for one, place in places if np.linalg.norm(place) < 2.5]
+        none += not near
+        points += [place for _, place in near[:1]]
+        counts += [len(one.branches) for one, _ in near[:1]]
+    assert none <= 1
     # two roadways that part at 40 degrees are one for six metres: their point is not where it was drawn, but repeats
     assert np.median(np.linalg.norm(points, axis=1)) < (2.0 if shape == "Y40" else 0.5)
     assert np.linalg.norm(np.std(points, axis=0)) < 0.5
@@ -166,16 +180,18 @@ def described(shape: str, way: list[F64], seed: int) -> WallContour:
 
 
 def test_an_intersection_is_more_like_itself_from_elsewhere_than_like_others() -> None:
-    """Stored when flown along x; seen again from the roadway at 180 degrees, flown the other way."""
-    stored = {shape: described(shape, along_x(-9, 2), seed=1) for shape in SHAPES}
+    """Stored when flown through in one way; seen again when flown through in the other."""
+    stored = {shape: described(shape, way_through(shape, -8.0, 2.0), seed=1) for shape in SHAPES}
+    around = se3.exp(np.array([0, 0, np.pi, 0, 0, 0]))
     right = 0
     for shape in SHAPES:
-        back = [at(-x, 0.0, 180.0) for x in np.arange(-9.0, 2.5, 1.0)]
+        back = [T @ around for T in reversed(way_through(shape, -2.0, 8.0))]
         again = described(shape, back, seed=2)
         ranked = sorted(stored, key=lambda name: -contour_likeness(stored[name], again, CONFIG).similarity)
         right += ranked[0] == shape
-        own = contour_likeness(stored[shape], again, CONFIG)
-        assert own.similarity > 0.6, shape
+        # where two roadways part at 40 degrees the point moves with the view (METHOD 5.2: a tenth are below 0.49)
+        least = 0.5 if shape == "Y40" else 0.6
+        assert contour_likeness(stored[shape], again, CONFIG).similarity > least, shape
     assert right >= 6
 
 

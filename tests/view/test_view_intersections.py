@@ -67,7 +67,7 @@ def test_a_database_of_another_version_is_no_flight(database: Path, tmp_path: Pa
     assert is_database(database)
     content = database.read_bytes()
     database.write_bytes(content.replace(b"mineloc.intersections/1", b"mineloc.intersections/9"))
-    with pytest.raises(FormatError):
+    with pytest.raises(FormatError, match=r"holds mineloc\.intersections/9"):
         show(database, save=tmp_path / "db.rrd", config=Config())
     database.write_bytes(content[:100])
     assert not is_database(database)

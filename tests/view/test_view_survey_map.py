@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from map_clouds import cloud_of
 from rrd_columns import Recording
 
 from mineloc.config import ViewConfig
@@ -40,18 +41,7 @@ def cloud() -> MapCloud:
     points[:n, 2], points[n : 2 * n, 2] = 0.0, 3.0
     points[2 * n : 3 * n, 1], points[3 * n :, 1] = -2.0, 2.0
     surface = np.repeat(np.array([SurfaceKind.FLOOR, SurfaceKind.ROOF, SurfaceKind.WALL, SurfaceKind.WALL]), n)
-    m = len(points)
-    return MapCloud(
-        origin_m=ORIGIN,
-        points_m=points.astype(np.float32),
-        normals=np.tile(np.array([0, 0, 1], np.float32), (m, 1)),
-        counts=np.full(m, 9, np.int32),
-        visits=np.full(m, 2, np.int32),
-        thickness_m=np.full(m, 0.01, np.float32),
-        near_m=np.full(m, 2.0, np.float32),
-        surface=surface.astype(np.uint8),
-        voxel_m=0.1,
-    )
+    return cloud_of(points, origin_m=ORIGIN, surface=surface)
 
 
 def keyframes(name: str, poses: F64) -> pl.DataFrame:
