@@ -6,16 +6,19 @@ from dataclasses import dataclass
 from typing import NamedTuple, cast
 
 import numpy as np
-from scipy.ndimage import binary_opening, distance_transform_edt, label, maximum_filter
+from scipy.ndimage import label
 
+from mineloc.compiled import njit
 from mineloc.config import IntersectionsConfig
 from mineloc.data import F64, I32, Bool
+from mineloc.places.clearance import Clearance, clearance_of, flood
 from mineloc.places.free_grid import FreeGrid
 
 _BEARINGS = 180
 _WIDEST = 3.2
 """An arc wider than so many clearances is no branch but a hall."""
-_CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.bool_)
+_PEAK_M, _PEAKS_APART_M = 0.9, 0.8
+"""The clearance is largest within so far of a peak; nearer peaks are one place."""
 _LEAST = 3
 """Branches that make a junction."""
 _AGAIN_M = 0.4
@@ -77,30 +80,22 @@ def find_junctions(grid: FreeGrid, config: IntersectionsConfig, *, at_m: F64 | N
         at_m: (2,) where the drone is; the middle of the grid without it.
     """
     here = np.zeros(2) if at_m is None else at_m
-    free = _reached(grid, here)
-    if free is None:
-        return []
-    clearance = np.asarray(distance_transform_edt(free), dtype=np.float64) * grid.cell_m
+    at = (here - grid.origin_m) / grid.cell_m
+    seen = clearance_of(
+        grid.is_open,
+        (float(at[1]), float(at[0])),
+        window=2 * round(_PEAK_M / grid.cell_m) + 1,
+        least=0.5 * config.min_branch_m / grid.cell_m,
+        within=config.search_m / grid.cell_m,
+    )
     found: list[Junction] = []
-    for place in _widest(grid, clearance, here, config):
-        junction = _junction_at(grid, free, place, clearance, config)
+    for place, room_m in _widest(grid, seen):
+        junction = _junction_at(grid, seen.free, place, room_m, config)
         if junction is not None:
             apart = max(config.apart_m, 1.2 * junction.clearance_m)
             if all(np.linalg.norm(junction.point_m - other.point_m) > apart for other in found):
                 found.append(junction)
     return found
-
-
-def _reached(grid: FreeGrid, here: F64) -> Bool | None:
-    """(rows, columns) opened free space that hangs together with the drone's place; None without any."""
-    free = np.asarray(binary_opening(grid.is_open, _CROSS), dtype=np.bool_)
-    parts, count = _parts(free)
-    if not count:
-        return None
-    rows, columns = np.nonzero(free)
-    places = grid.origin_m + grid.cell_m * np.column_stack([columns, rows])
-    nearest = int(np.hypot(*(places - here).T).argmin())
-    return parts == parts[rows[nearest], columns[nearest]]
 
 
 def _parts(mask: Bool) -> tuple[I32, int]:
@@ -109,26 +104,21 @@ def _parts(mask: Bool) -> tuple[I32, int]:
     return numbered, count
 
 
-def _widest(grid: FreeGrid, clearance: F64, here: F64, config: IntersectionsConfig) -> F64:
-    """(k, 2) local maxima of the clearance, the largest first."""
-    window = 2 * round(0.9 / grid.cell_m) + 1
-    peaks = (clearance == maximum_filter(clearance, window)) & (clearance > 0.5 * config.min_branch_m)
-    rows, columns = np.nonzero(peaks)
+def _widest(grid: FreeGrid, seen: Clearance) -> list[tuple[F64, float]]:
+    """Peaks of the clearance as (2,) places with their clearance in metres, the largest first; no two close by."""
+    rows, columns = seen.peaks[:, 0], seen.peaks[:, 1]
+    room = seen.cells[rows, columns] * grid.cell_m
     places = grid.origin_m + grid.cell_m * np.column_stack([columns, rows])
-    near = np.hypot(*(places - here).T) < config.search_m
-    order = np.argsort(-clearance[rows, columns][near], kind="stable")
-    kept: list[F64] = []
-    for place in places[near][order]:
-        if all(np.hypot(*(place - other)) > 0.8 for other in kept):
-            kept.append(place)
-    return np.array(kept).reshape(-1, 2)
+    kept: list[tuple[F64, float]] = []
+    for k in np.argsort(-room, kind="stable"):
+        if all(np.hypot(*(places[k] - other)) > _PEAKS_APART_M for other, _ in kept):
+            kept.append((places[k], float(room[k])))
+    return kept
 
 
 def _junction_at(
-    grid: FreeGrid, free: Bool, place: F64, clearance: F64, config: IntersectionsConfig
+    grid: FreeGrid, free: Bool, place: F64, room: float, config: IntersectionsConfig
 ) -> Junction | None:
-    row, column = grid.cells_of(place[None])
-    room = float(clearance[row[0], column[0]])
     branches = branches_around(grid, free, place, room, config)
     if len(branches) < _LEAST:
         return None
@@ -193,25 +183,9 @@ def _inwards(arc: _Arc, rings: list[list[_Arc]], turn_rad: float) -> list[_Arc] 
 
 def _arcs(grid: FreeGrid, free: Bool, centre_m: F64, radius_m: float, config: IntersectionsConfig) -> list[_Arc]:
     """The open arcs of one ring that are wide enough and reached from its centre."""
-    reach = radius_m + 0.5 * config.ring_width_m
-    n = len(free)
-    low = np.maximum(np.floor((centre_m - reach - grid.origin_m) / grid.cell_m).astype(np.int64), 0)
-    high = np.minimum(np.ceil((centre_m + reach - grid.origin_m) / grid.cell_m).astype(np.int64) + 1, n)
-    if (low >= high).any():
-        return []
-    part = free[low[1] : high[1], low[0] : high[0]]
-    x = grid.origin_m[0] + grid.cell_m * np.arange(low[0], high[0]) - centre_m[0]
-    y = grid.origin_m[1] + grid.cell_m * np.arange(low[1], high[1]) - centre_m[1]
-    r = np.hypot(x[None, :], y[:, None])
-    parts, _ = _parts(part & (r <= reach))
-    middle = np.unravel_index(np.where(parts > 0, r, np.inf).argmin(), r.shape)
-    ring = (parts == parts[middle]) & (parts > 0) & (np.abs(r - radius_m) <= 0.5 * config.ring_width_m)
-    rows, columns = np.nonzero(ring)
-    if not len(rows):
-        return []
-    bearing = np.arctan2(y[rows], x[columns])
-    filled = np.zeros(_BEARINGS, np.bool_)
-    filled[(bearing % (2 * np.pi) * (_BEARINGS / (2 * np.pi))).astype(np.int64) % _BEARINGS] = True
+    at = (centre_m - grid.origin_m) / grid.cell_m
+    width = 0.5 * config.ring_width_m / grid.cell_m
+    filled = ring(free, at[1], at[0], radius_m / grid.cell_m, width, _BEARINGS)
     step_m = 2 * np.pi * radius_m / _BEARINGS
     filled = _closed_ring(filled, max(1, round(1.5 * grid.cell_m / step_m)))
     out: list[_Arc] = []
@@ -223,6 +197,52 @@ def _arcs(grid: FreeGrid, free: Bool, centre_m: F64, radius_m: float, config: In
             point = centre_m + radius_m * np.array([np.cos(angle), np.sin(angle)])
             out.append(_Arc(angle % (2 * np.pi), point, chord, half))
     return out
+
+
+@njit(cache=True, nogil=True)
+def ring(free: Bool, row: float, column: float, radius: float, half_width: float, bearings: int) -> Bool:
+    """(bearings,) where a ring, in cells, is open and reached from its centre within it."""
+    reach = radius + half_width
+    low_r, high_r = max(int(np.floor(row - reach)), 0), min(int(np.ceil(row + reach)) + 1, free.shape[0])
+    low_c, high_c = max(int(np.floor(column - reach)), 0), min(int(np.ceil(column + reach)) + 1, free.shape[1])
+    filled = np.zeros(bearings, np.bool_)
+    if low_r >= high_r or low_c >= high_c:
+        return filled
+    disc = np.zeros((high_r - low_r, high_c - low_c), np.bool_)
+    start_r, start_c, nearest = -1, -1, np.inf
+    for r in range(low_r, high_r):
+        for c in range(low_c, high_c):
+            away = (r - row) ** 2 + (c - column) ** 2
+            if free[r, c] and away <= reach * reach:
+                disc[r - low_r, c - low_c] = True
+                if away < nearest:
+                    start_r, start_c, nearest = r - low_r, c - low_c, away
+    if start_r < 0:
+        return filled
+    inside = np.zeros_like(disc)
+    flood(disc, start_r, start_c, inside)
+    for r in range(low_r, high_r):
+        for c in range(low_c, high_c):
+            if not inside[r - low_r, c - low_c]:
+                continue
+            away = np.sqrt((r - row) ** 2 + (c - column) ** 2)
+            if abs(away - radius) <= half_width:
+                turn = np.arctan2(r - row, c - column) / (2 * np.pi)
+                filled[int((turn - np.floor(turn)) * bearings) % bearings] = True
+    return filled
+
+
+def ring_plainly(free: Bool, row: float, column: float, radius: float, half_width: float, bearings: int) -> Bool:
+    """`ring` in scipy: what the kernel is held to."""
+    r, c = np.mgrid[: free.shape[0], : free.shape[1]]
+    away = np.hypot(r - row, c - column)
+    parts, _ = _parts(free & (away <= radius + half_width))
+    middle = np.unravel_index(np.where(parts > 0, away, np.inf).argmin(), away.shape)
+    ring = (parts == parts[middle]) & (parts > 0) & (np.abs(away - radius) <= half_width)
+    bearing = np.arctan2(r[ring] - row, c[ring] - column)
+    filled = np.zeros(bearings, np.bool_)
+    filled[(bearing % (2 * np.pi) * (bearings / (2 * np.pi))).astype(np.int64) % bearings] = True
+    return filled
 
 
 def _closed_ring(filled: Bool, gap: int) -> Bool:

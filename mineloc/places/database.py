@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mineloc.config import IntersectionsConfig
-from mineloc.data import F64, Intersection, IntersectionDatabase
+from mineloc.data import F64, Intersection, IntersectionDatabase, Lineage
 from mineloc.places.contour_matrix import matrix_likeness
 from mineloc.places.wall_contour import branches_fit, contour_likeness
 
@@ -19,6 +19,7 @@ def database_of(
     grid_origin_m: F64,
     is_grid: bool,
     map_sha256: str,
+    lineage: Lineage | None = None,
 ) -> IntersectionDatabase:
     """Compare every intersection with every other, and draw the threshold from that.
 
@@ -30,6 +31,7 @@ def database_of(
         intersections: by rising id.
         config: `threshold_floor`, `threshold_quantile`, `twin_matrix`, `branch_match_deg`.
         grid_origin_m, is_grid, map_sha256: of the map.
+        lineage: of a database that follows others, `map_sha256` with it; None for a first one.
     """
     contour, matrix = similarities(intersections, config)
     different = contour[~np.eye(len(contour), dtype=np.bool_)]
@@ -45,7 +47,7 @@ def database_of(
         intersections=tuple(intersections),
         grid_origin_m=grid_origin_m,
         is_grid=is_grid,
-        map_sha256=map_sha256,
+        lineage=lineage or Lineage.first(map_sha256, (one.id for one in intersections)),
         contour_similarity=contour,
         matrix_similarity=matrix,
         contour_threshold=threshold,

@@ -47,53 +47,81 @@ class FreeGrid:
         return cell[:, 1], cell[:, 0]
 
 
-def free_grid(clouds_level: Sequence[F32], T_here_there: F64, config: IntersectionsConfig) -> FreeGrid:
+@dataclass(frozen=True, slots=True, eq=False)
+class PlanView:
+    """One keyframe seen from above.
+
+    Attributes:
+        reach_m: (720,) farthest return of each bearing around the sensor, counter-clockwise from x; 0 without any.
+        walls_m: (n, 2) float32 returns near the height of the sensor.
+    """
+
+    reach_m: F64
+    walls_m: F32
+
+
+def plan_view(cloud_level: F32, config: IntersectionsConfig) -> PlanView:
+    """What a keyframe shows of the plan.
+
+    Args:
+        cloud_level: (n, 3) points around the sensor, levelled.
+        config: `range_m`, `wall_band_m`.
+    """
+    return PlanView(*_view(np.ascontiguousarray(cloud_level), config.range_m, config.wall_band_m))
+
+
+def free_grid(views: Sequence[PlanView], T_here_there: F64, config: IntersectionsConfig) -> FreeGrid:
     """Lay keyframes over each other.
 
     Args:
-        clouds_level: (n, 3) points of each keyframe around its own sensor, levelled.
+        views: of each keyframe.
         T_here_there: (k, 4, 4) from each one's level frame to the one in whose middle the grid lies.
-        config: `cell_m`, `half_m`, `range_m`, `wall_band_m`, `wall_votes`.
+        config: `cell_m`, `half_m`, `range_m`, `wall_votes`.
     """
     cells = 2 * round(config.half_m / config.cell_m) + 1
     origin = -0.5 * (cells - 1) * config.cell_m
-    opened, closed = np.zeros((cells, cells), np.int32), np.zeros((cells, cells), np.int32)
-    for index, (cloud, T) in enumerate(zip(clouds_level, T_here_there, strict=True)):
-        stamp = np.zeros((2, cells, cells), np.int32)
+    opened, closed, stamp = (np.zeros((cells, cells), np.int32) for _ in range(3))
+    for index, (view, T) in enumerate(zip(views, T_here_there, strict=True)):
         _vote(
-            np.ascontiguousarray(cloud), np.ascontiguousarray(T), origin, config.cell_m,
-            config.range_m, config.wall_band_m, index + 1, stamp, opened, closed,
+            view.walls_m, view.reach_m, np.ascontiguousarray(T), origin, config.cell_m, config.range_m,
+            index + 1, stamp, opened, closed,
         )  # fmt: skip
-    sight = np.full((cells, cells), Sight.UNKNOWN, np.uint8)
-    walls = (closed > 0) & (closed >= config.wall_votes * (opened + closed))
-    sight[(opened > 0) & ~walls] = Sight.OPEN
-    sight[walls] = Sight.WALL
-    return FreeGrid(config.cell_m, np.array([origin, origin]), sight)
+    return FreeGrid(config.cell_m, np.array([origin, origin]), _sight(opened, closed, config.wall_votes))
+
+
+@njit(cache=True, nogil=True)
+def _view(points: F32, range_m: float, band_m: float) -> tuple[F64, F32]:
+    farthest = np.zeros(_BEAMS)
+    walls = np.empty((len(points), 2), np.float32)
+    count = 0
+    for i in range(len(points)):
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        r = np.sqrt(x * x + y * y)
+        if r < 1e-6:
+            continue
+        beam = int((np.arctan2(y, x) / (2 * np.pi) + 1.0) * _BEAMS) % _BEAMS
+        farthest[beam] = max(farthest[beam], r)
+        if r <= range_m and abs(z) <= band_m:
+            walls[count, 0], walls[count, 1] = points[i, 0], points[i, 1]
+            count += 1
+    return farthest, walls[:count].copy()
 
 
 @njit(cache=True, nogil=True)
 def _vote(
-    points: F32, T: F64, origin: float, cell_m: float, range_m: float, band_m: float,
+    walls: F32, farthest: F64, T: F64, origin: float, cell_m: float, range_m: float,
     vote: int, stamp: I32, opened: I32, closed: I32,
 ) -> None:  # fmt: skip
     """One keyframe's votes: a cell counts once as wall, else once as open."""
     n = len(opened)
     sx, sy = T[0, 3], T[1, 3]
-    for i in range(len(points)):
-        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        r = np.sqrt(x * x + y * y)
-        if r > range_m or abs(z) > band_m or r < 1e-6:
-            continue
+    for i in range(len(walls)):
+        x, y = np.float64(walls[i, 0]), np.float64(walls[i, 1])
         px, py = T[0, 0] * x + T[0, 1] * y + sx, T[1, 0] * x + T[1, 1] * y + sy
         column, row = int(np.rint((px - origin) / cell_m)), int(np.rint((py - origin) / cell_m))
-        if 0 <= row < n and 0 <= column < n and stamp[0, row, column] != vote:
-            stamp[0, row, column] = vote
+        if 0 <= row < n and 0 <= column < n and stamp[row, column] != vote:
+            stamp[row, column] = vote
             closed[row, column] += 1
-    farthest = np.zeros(_BEAMS)
-    for i in range(len(points)):
-        x, y = np.float64(points[i, 0]), np.float64(points[i, 1])
-        beam = int((np.arctan2(y, x) / (2 * np.pi) + 1.0) * _BEAMS) % _BEAMS
-        farthest[beam] = max(farthest[beam], np.sqrt(x * x + y * y))
     for beam in range(_BEAMS):
         reach = min(farthest[beam] - _SHORT_M, range_m)
         if reach <= 0.0:
@@ -105,15 +133,22 @@ def _vote(
         for k in range(steps + 1):
             s = 0.7 * cell_m * k
             column, row = int(np.rint((sx + s * ux - origin) / cell_m)), int(np.rint((sy + s * uy - origin) / cell_m))
-            if not (0 <= row < n and 0 <= column < n):
-                continue
-            if stamp[0, row, column] != vote and stamp[1, row, column] != vote:
-                stamp[1, row, column] = vote
+            # a cell of this keyframe's walls, or one already counted, carries its stamp
+            if 0 <= row < n and 0 <= column < n and stamp[row, column] != vote:
+                stamp[row, column] = vote
                 opened[row, column] += 1
 
 
+def _sight(opened: I32, closed: I32, wall_votes: float) -> U8:
+    sight = np.full(opened.shape, Sight.UNKNOWN, np.uint8)
+    walls = (closed > 0) & (closed >= wall_votes * (opened + closed))
+    sight[(opened > 0) & ~walls] = Sight.OPEN
+    sight[walls] = Sight.WALL
+    return sight
+
+
 def free_grid_plainly(clouds_level: Sequence[F32], T_here_there: F64, config: IntersectionsConfig) -> FreeGrid:
-    """`free_grid` in plain numpy: what the kernel is held to."""
+    """`plan_view` and `free_grid` in plain numpy, of (n, 3) levelled points each: what the kernels are held to."""
     cells = 2 * round(config.half_m / config.cell_m) + 1
     origin = -0.5 * (cells - 1) * config.cell_m
     opened, closed = np.zeros((cells, cells), np.int32), np.zeros((cells, cells), np.int32)
@@ -136,11 +171,7 @@ def free_grid_plainly(clouds_level: Sequence[F32], T_here_there: F64, config: In
             crossed |= _mask(T[:2, 3] + s[:, None] * direction, origin, cells, config.cell_m)
         closed += wall
         opened += crossed & ~wall
-    sight = np.full((cells, cells), Sight.UNKNOWN, np.uint8)
-    walls = (closed > 0) & (closed >= config.wall_votes * (opened + closed))
-    sight[(opened > 0) & ~walls] = Sight.OPEN
-    sight[walls] = Sight.WALL
-    return FreeGrid(config.cell_m, np.array([origin, origin]), sight)
+    return FreeGrid(config.cell_m, np.array([origin, origin]), _sight(opened, closed, config.wall_votes))
 
 
 def _mask(places: F64, origin: float, cells: int, cell_m: float) -> Bool:

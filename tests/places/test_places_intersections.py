@@ -7,13 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plan_scenes import Plan
+from scipy.ndimage import uniform_filter
 
 from mineloc import se3
 from mineloc.config import IntersectionsConfig
 from mineloc.data import F64, Sight, WallContour
-from mineloc.places.branches import Branch, Junction, find_junctions, invariant_point
+from mineloc.places.branches import Branch, Junction, find_junctions, invariant_point, ring, ring_plainly
 from mineloc.places.contour_matrix import contour_matrix, matrix_likeness
-from mineloc.places.free_grid import FreeGrid, free_grid, free_grid_plainly
+from mineloc.places.clearance import clearance_of, clearance_plainly
+from mineloc.places.free_grid import FreeGrid, free_grid, free_grid_plainly, plan_view
 from mineloc.places.wall_contour import (
     branches_fit,
     contour_likeness,
@@ -44,7 +46,7 @@ def flown_grid(plan: Plan, way: list[F64], seed: int = 0) -> FreeGrid:
     """Free space as known at the last of some poses of a flight."""
     rng = np.random.default_rng(seed)
     sweeps = [plan.sweep(T[:2, 3], float(np.arctan2(T[1, 0], T[0, 0])), rng) for T in way]
-    return free_grid(sweeps, se3.inverse(way[-1]) @ np.array(way), CONFIG)
+    return free_grid([plan_view(one, CONFIG) for one in sweeps], se3.inverse(way[-1]) @ np.array(way), CONFIG)
 
 
 def along_x(start_m: float, end_m: float) -> list[F64]:
@@ -62,9 +64,27 @@ def test_the_kernel_votes_as_plain_numpy_does(seed: int, keyframes: int, half_m:
     config = CONFIG.model_copy(update={"half_m": half_m, "range_m": 6.0})
     clouds = [rng.normal(0, 3, (int(rng.integers(0, 200)), 3)).astype(np.float32) for _ in range(keyframes)]
     poses = np.array([at(*rng.normal(0, 2, 2), float(rng.uniform(-180, 180))) for _ in range(keyframes)])
-    fast, plain = free_grid(clouds, poses, config), free_grid_plainly(clouds, poses, config)
+    views = [plan_view(cloud, config) for cloud in clouds]
+    fast, plain = free_grid(views, poses, config), free_grid_plainly(clouds, poses, config)
     # a place on the line between two cells may round either way
     assert (fast.sight != plain.sight).mean() < 0.002
+
+
+@settings(deadline=None, max_examples=60)
+@given(seed=st.integers(0, 10_000), rows=st.integers(3, 40), columns=st.integers(3, 40), smooth=st.integers(1, 9))
+def test_clearance_and_rings_are_those_of_scipy(seed: int, rows: int, columns: int, smooth: int) -> None:
+    rng = np.random.default_rng(seed)
+    noise = rng.normal(size=(rows, columns))
+    is_open = np.asarray(uniform_filter(noise, smooth)) > rng.uniform(-0.3, 0.3) / smooth
+    here = float(rng.uniform(0, rows)), float(rng.uniform(0, columns))
+    how = {"window": 5, "least": 1.2, "within": 18.0}
+    fast, plain = clearance_of(is_open, here, **how), clearance_plainly(is_open, here, **how)
+    assert (fast.free == plain.free).all()
+    if not plain.free.all():  # without any wall there is no distance to one
+        assert fast.cells == pytest.approx(plain.cells)
+        assert (fast.peaks == plain.peaks).all()
+    radius = float(rng.uniform(1, 15))
+    assert (ring(plain.free, *here, radius, 1.0, 90) == ring_plainly(plain.free, *here, radius, 1.0, 90)).all()
 
 
 def way_through(shape: str, start_m: float, end_m: float) -> list[F64]:
