@@ -27,6 +27,7 @@ from mineloc.data.flight import Trajectory as Trajectory
 from mineloc.data.intersections import Intersection as Intersection
 from mineloc.data.intersections import IntersectionDatabase as IntersectionDatabase
 from mineloc.data.intersections import IntersectionKind as IntersectionKind
+from mineloc.data.intersections import Lineage as Lineage
 from mineloc.data.intersections import Sight as Sight
 from mineloc.data.intersections import WallContour as WallContour
 from mineloc.data.map_cloud import MapCloud as MapCloud

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Literal
@@ -100,15 +102,42 @@ class Intersection:
         return len(self.contour.branches_rad)
 
 
+@dataclass(frozen=True, slots=True)
+class Lineage:
+    """Where a database comes from.
+
+    Attributes:
+        version: 1 for the first of a mine, rising from parent to child.
+        parents: sha256 of the database files that it follows; none for the first.
+        next_id: above every id that it or a parent ever used; ids of what is gone are not given again.
+        maps: sha256 of the manifests of the maps that its intersections were found in, rising.
+    """
+
+    version: int
+    parents: tuple[str, ...]
+    next_id: int
+    maps: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        need(self.version >= 1, "version must be positive")
+        need((self.version == 1) == (not self.parents), "the first version alone has no parents")
+        need(bool(self.maps) and list(self.maps) == sorted(set(self.maps)), "maps must rise")
+
+    @staticmethod
+    def first(map_sha256: str, ids: Iterable[int]) -> Lineage:
+        """Of a database that follows none, with those ids."""
+        return Lineage(1, (), max(ids, default=-1) + 1, (map_sha256,))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class IntersectionDatabase:
-    """All intersections of one map.
+    """All intersections of a map, or of several maps in one grid.
 
     Attributes:
         intersections: by rising id.
         grid_origin_m: (3,) of the map frame in the mine grid; zero without a grid.
         is_grid: whether the map stands in the mine grid.
-        map_sha256: of the manifest of the map that it was made from.
+        lineage: version, parents and maps.
         contour_similarity, matrix_similarity: (k, k) between the intersections, the best turn each (paper A, Fig. 16).
         contour_threshold: similarity above which two contours may be one place; follows from the matrix.
         twins: pairs of ids that contour and matrix cannot tell apart.
@@ -117,7 +146,7 @@ class IntersectionDatabase:
     intersections: tuple[Intersection, ...]
     grid_origin_m: F64
     is_grid: bool
-    map_sha256: str
+    lineage: Lineage
     contour_similarity: F64
     matrix_similarity: F64
     contour_threshold: float
@@ -127,12 +156,19 @@ class IntersectionDatabase:
         k = len(self.intersections)
         ids = [one.id for one in self.intersections]
         need(ids == sorted(set(ids)), "ids must rise")
+        need(not ids or 0 <= ids[0] <= ids[-1] < self.lineage.next_id, "ids must be below next_id")
         for name in ("contour_similarity", "matrix_similarity"):
             need(getattr(self, name).shape == (k, k), f"{name} must be (k, k)")
         freeze(self)
 
     def __len__(self) -> int:
         return len(self.intersections)
+
+    @property
+    def map_sha256(self) -> str:
+        """Of the manifest of its map; of several maps, a name for all of them together."""
+        maps = self.lineage.maps
+        return maps[0] if len(maps) == 1 else hashlib.sha256("+".join(maps).encode()).hexdigest()
 
     def by_id(self, id: int) -> Intersection:
         """The intersection with that id.

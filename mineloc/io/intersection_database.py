@@ -7,7 +7,6 @@ bytes.
 
 from __future__ import annotations
 
-import base64
 import json
 import struct
 from pathlib import Path
@@ -19,16 +18,33 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from zstandard import ZstdError
 
-from mineloc.data import F32, F64, Intersection, IntersectionDatabase, WallContour
+from mineloc.data import F32, F64, Intersection, IntersectionDatabase, Lineage, WallContour
 from mineloc.errors import FormatError
+from mineloc.io.intersection_messages import cloud_message, points_and_normals, scene_message
 from mineloc.output import new_file
 
-SCHEMA = "mineloc.intersections/1"
+SCHEMA_VERSION = 2
+_FAMILY = "mineloc.intersections/"
+SCHEMA = f"{_FAMILY}{SCHEMA_VERSION}"
 _FACTS, _RECORDS = "/intersections/facts", "/intersections/records"
 _CLOUDS, _SCENE = "/intersections/clouds", "/intersections/scene"
-_POINT_BYTES = 24
-_FLOAT32 = 7  # of foxglove.PackedElementField
-_BRANCH_M = 3.0
+_ORIGINS = {
+    f"{_FAMILY}1": frozenset({"map_sha256"}),
+    SCHEMA: frozenset({"version", "parents", "next_id", "maps"}),
+}
+"""Facts that are told in one version of the schema alone: version 1 knew neither parents nor several maps."""
+_FACT_NAMES = frozenset(
+    {"count", "grid_origin_m", "is_grid", "contour_similarity", "matrix_similarity", "contour_threshold", "twins"}
+)
+_RECORD_NAMES = frozenset(
+    {"id", "name", "kind", "point_map", "covariance_m2", "branches_rad", "contour_radius_m", "contour_distance"}
+    | {"contour_sight", "matrix", "neighbours", "quality"}
+)
+_DAMAGE = (
+    *(OSError, McapError, ValueError, LookupError, TypeError, EOFError, struct.error, ZstdError),
+    *(MemoryError, OverflowError),  # of lengths that are not what they were
+)
+"""What the readers of MCAP, zstd and JSON raise over bytes that are not what they were."""
 
 
 def write_database(path: Path, database: IntersectionDatabase, *, overwrite: bool = False) -> None:
@@ -60,10 +76,10 @@ def write_database(path: Path, database: IntersectionDatabase, *, overwrite: boo
         facts = json.dumps(_facts(database), sort_keys=True, allow_nan=False).encode()
         writer.add_message(channels[_FACTS], log_time=0, publish_time=0, data=facts)
         for k, one in enumerate(database.intersections):
-            for topic, message in ((_RECORDS, _record(one)), (_CLOUDS, _cloud(one))):
+            for topic, message in ((_RECORDS, _record(one)), (_CLOUDS, cloud_message(one))):
                 data = json.dumps(message, sort_keys=True, allow_nan=False).encode()
                 writer.add_message(channels[topic], log_time=k, publish_time=k, sequence=k, data=data)
-        scene = json.dumps(_scene(database), sort_keys=True, allow_nan=False).encode()
+        scene = json.dumps(scene_message(database), sort_keys=True, allow_nan=False).encode()
         writer.add_message(channels[_SCENE], log_time=0, publish_time=0, data=scene)
         writer.finish()
 
@@ -71,31 +87,59 @@ def write_database(path: Path, database: IntersectionDatabase, *, overwrite: boo
 def read_database(path: Path) -> IntersectionDatabase:
     """Read a database, every byte of it checked.
 
+    Version 1 of the schema is read too: it tells all that a first version of a database needs.
+
     Raises:
-        FormatError: missing, damaged, another kind of file, or of another version.
+        FormatError: missing, damaged, another kind of file, or of a version of the schema that is not known.
     """
+    if path.is_dir():
+        raise FormatError(path, "is a folder", expected="a database of intersections", todo="check the path")
     try:
         with path.open("rb") as stream:
             reader = make_reader(stream, validate_crcs=True)
-            kinds = [one.name for one in reader.iter_metadata() if one.name.startswith("mineloc.intersections/")]
-            if kinds != [SCHEMA]:
-                found = kinds[0] if kinds else "no database of intersections"
-                raise FormatError(path, f"holds {found}", expected=SCHEMA, todo="make it again with this version")
+            schema = _known_schema(path, [one.name for one in reader.iter_metadata()])
             messages: dict[str, list[Any]] = {_FACTS: [], _RECORDS: [], _CLOUDS: []}
             for _, channel, message in reader.iter_messages(topics=list(messages)):
                 messages[channel.topic].append(json.loads(message.data))
         (facts,) = messages[_FACTS]
-        return _database(facts, messages[_RECORDS], messages[_CLOUDS])
+        return _database(schema, facts, messages[_RECORDS], messages[_CLOUDS])
     except FormatError:
         raise
     except FileNotFoundError as error:
         raise FormatError(
             path, "no such file", expected="a database of intersections", todo="check the path"
         ) from error
-    except (OSError, McapError, ValueError, LookupError, TypeError, EOFError, struct.error, ZstdError) as error:
+    except _DAMAGE as error:
+        reason = str(error) or type(error).__name__
         raise FormatError(
-            path, f"is damaged ({error})", expected="a whole database of intersections", todo="make it again"
+            path,
+            f"is damaged ({reason})",
+            expected="a whole database of intersections",
+            todo="take a copy of it, or make it again",
         ) from error
+
+
+def _known_schema(path: Path, names: list[str]) -> str:
+    """The schema that a file says it has.
+
+    Raises:
+        FormatError: none, or one that this version of mineloc cannot read in full.
+    """
+    found = [name for name in names if name.startswith(_FAMILY)]
+    if len(found) == 1 and found[0] in _ORIGINS:
+        return found[0]
+    if not found:
+        raise FormatError(
+            path, "holds no database of intersections", expected=SCHEMA, todo="name a file of `mineloc database`"
+        )
+    number = found[0].removeprefix(_FAMILY)
+    is_newer = number.isdecimal() and int(number) > SCHEMA_VERSION
+    raise FormatError(
+        path,
+        f"holds {' and '.join(found)}",
+        expected=" or ".join(_ORIGINS),
+        todo="update mineloc, which is older than the file" if is_newer else "make it again with this mineloc",
+    )
 
 
 def is_database(path: Path) -> bool:
@@ -103,9 +147,9 @@ def is_database(path: Path) -> bool:
     try:
         with path.open("rb") as stream:
             names = [one.name for one in make_reader(stream).iter_metadata()]
-    except (OSError, McapError, ValueError, EOFError, struct.error):
+    except _DAMAGE:
         return False
-    return any(name.startswith("mineloc.intersections/") for name in names)
+    return any(name.startswith(_FAMILY) for name in names)
 
 
 def _facts(database: IntersectionDatabase) -> dict[str, Any]:
@@ -113,7 +157,10 @@ def _facts(database: IntersectionDatabase) -> dict[str, Any]:
         "count": len(database),
         "grid_origin_m": database.grid_origin_m.tolist(),
         "is_grid": database.is_grid,
-        "map_sha256": database.map_sha256,
+        "version": database.lineage.version,
+        "parents": list(database.lineage.parents),
+        "next_id": database.lineage.next_id,
+        "maps": list(database.lineage.maps),
         "contour_similarity": database.contour_similarity.tolist(),
         "matrix_similarity": database.matrix_similarity.tolist(),
         "contour_threshold": database.contour_threshold,
@@ -139,72 +186,14 @@ def _record(one: Intersection) -> dict[str, Any]:
     }
 
 
-def _cloud(one: Intersection) -> dict[str, Any]:
-    names = ("x", "y", "z", "normal_x", "normal_y", "normal_z")
-    data = np.column_stack([one.points_m, one.normals]).astype("<f4").tobytes()
-    return {
-        "timestamp": {"sec": 0, "nsec": one.id},
-        "frame_id": "map",
-        "pose": {
-            "position": dict(zip("xyz", one.point_map.tolist(), strict=True)),
-            "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
-        },
-        "point_stride": _POINT_BYTES,
-        "fields": [{"name": name, "offset": 4 * k, "type": _FLOAT32} for k, name in enumerate(names)],
-        "data": base64.b64encode(data).decode(),
-    }
-
-
-def _scene(database: IntersectionDatabase) -> dict[str, Any]:
-    """Names over the points, and a line a branch."""
-    entities = []
-    for one in database.intersections:
-        x, y, z = one.point_map.tolist()
-        ends = [
-            {"x": x + _BRANCH_M * float(np.cos(b)), "y": y + _BRANCH_M * float(np.sin(b)), "z": z}
-            for b in one.contour.branches_rad
-        ]
-        centre = {"x": x, "y": y, "z": z}
-        orange, white = {"r": 0.9, "g": 0.6, "b": 0.0, "a": 1.0}, {"r": 1.0, "g": 1.0, "b": 1.0, "a": 1.0}
-        level = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
-        entities.append(
-            {
-                "timestamp": {"sec": 0, "nsec": 0},
-                "frame_id": "map",
-                "id": str(one.id),
-                "lifetime": {"sec": 0, "nsec": 0},
-                "frame_locked": False,
-                "metadata": [],
-                "lines": [
-                    {
-                        "type": 2,
-                        "pose": {"position": {"x": 0.0, "y": 0.0, "z": 0.0}, "orientation": level},
-                        "thickness": 0.2,
-                        "scale_invariant": False,
-                        "points": [point for end in ends for point in (centre, end)],
-                        "color": orange,
-                        "colors": [],
-                        "indices": [],
-                    }
-                ],
-                "texts": [
-                    {
-                        "pose": {"position": {"x": x, "y": y, "z": z + 2.0}, "orientation": level},
-                        "billboard": True,
-                        "font_size": 1.5,
-                        "scale_invariant": False,
-                        "color": white,
-                        "text": one.name,
-                    }
-                ],
-            }
-        )
-    return {"deletions": [], "entities": entities}
-
-
 def _database(
-    facts: dict[str, Any], records: list[dict[str, Any]], clouds: list[dict[str, Any]]
+    schema: str, facts: dict[str, Any], records: list[dict[str, Any]], clouds: list[dict[str, Any]]
 ) -> IntersectionDatabase:
+    # metadata, which names the schema, has no checksum: facts of another one tell that it is wrong
+    if frozenset(facts) != _FACT_NAMES | _ORIGINS[schema] or any(
+        frozenset(record) != _RECORD_NAMES for record in records
+    ):
+        raise ValueError(f"not the fields of {schema}")
     if len(records) != facts["count"] or len(clouds) != facts["count"]:
         raise ValueError(f"{len(records)} records and {len(clouds)} clouds of {facts['count']}")
     count = int(facts["count"])
@@ -212,7 +201,7 @@ def _database(
         intersections=tuple(_intersection(record, cloud) for record, cloud in zip(records, clouds, strict=True)),
         grid_origin_m=_doubles(facts["grid_origin_m"]),
         is_grid=bool(facts["is_grid"]),
-        map_sha256=str(facts["map_sha256"]),
+        lineage=_lineage(facts, records),
         contour_similarity=_doubles(facts["contour_similarity"]).reshape(count, count),
         matrix_similarity=_doubles(facts["matrix_similarity"]).reshape(count, count),
         contour_threshold=float(facts["contour_threshold"]),
@@ -220,8 +209,20 @@ def _database(
     )
 
 
+def _lineage(facts: dict[str, Any], records: list[dict[str, Any]]) -> Lineage:
+    if "map_sha256" in facts:
+        # nothing of version 1 follows another: its ids are all that were ever given
+        return Lineage.first(str(facts["map_sha256"]), (int(record["id"]) for record in records))
+    return Lineage(
+        version=int(facts["version"]),
+        parents=tuple(str(one) for one in facts["parents"]),
+        next_id=int(facts["next_id"]),
+        maps=tuple(str(one) for one in facts["maps"]),
+    )
+
+
 def _intersection(record: dict[str, Any], cloud: dict[str, Any]) -> Intersection:
-    points = np.frombuffer(base64.b64decode(cloud["data"], validate=True), "<f4").reshape(-1, _POINT_BYTES // 4)
+    points, normals = points_and_normals(cloud)
     return Intersection(
         id=int(record["id"]),
         name=str(record["name"]),
@@ -235,8 +236,8 @@ def _intersection(record: dict[str, Any], cloud: dict[str, Any]) -> Intersection
             branches_rad=_doubles(record["branches_rad"]),
         ),
         matrix=_singles(record["matrix"]),
-        points_m=np.ascontiguousarray(points[:, :3], dtype=np.float32),
-        normals=np.ascontiguousarray(points[:, 3:], dtype=np.float32),
+        points_m=points,
+        normals=normals,
         neighbours=tuple((int(id), float(length_m)) for id, length_m in record["neighbours"]),
         quality=float(record["quality"]),
     )

@@ -19,9 +19,8 @@ def database_of(
     grid_origin_m: F64,
     is_grid: bool,
     map_sha256: str,
-    lineage: Lineage | None = None,
 ) -> IntersectionDatabase:
-    """Compare every intersection with every other, and draw the threshold from that.
+    """Compare every intersection with every other, and draw the threshold from that; the first version of a database.
 
     The threshold lies above nearly all pairs of different intersections, but not above the likeness that one has with
     itself seen from elsewhere; pairs above it are for the matrix, the neighbours and registration to tell apart, and
@@ -31,7 +30,6 @@ def database_of(
         intersections: by rising id.
         config: `threshold_floor`, `threshold_quantile`, `twin_matrix`, `branch_match_deg`.
         grid_origin_m, is_grid, map_sha256: of the map.
-        lineage: of a database that follows others, `map_sha256` with it; None for a first one.
     """
     contour, matrix = similarities(intersections, config)
     different = contour[~np.eye(len(contour), dtype=np.bool_)]
@@ -47,7 +45,7 @@ def database_of(
         intersections=tuple(intersections),
         grid_origin_m=grid_origin_m,
         is_grid=is_grid,
-        lineage=lineage or Lineage.first(map_sha256, (one.id for one in intersections)),
+        lineage=Lineage.first(map_sha256, (one.id for one in intersections)),
         contour_similarity=contour,
         matrix_similarity=matrix,
         contour_threshold=threshold,

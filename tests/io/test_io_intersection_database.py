@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,9 +16,9 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from mineloc.config import IntersectionsConfig
-from mineloc.data import Intersection, IntersectionDatabase, Sight, WallContour
+from mineloc.data import Intersection, IntersectionDatabase, Lineage, Sight, WallContour
 from mineloc.errors import FormatError, OutputError
-from mineloc.io.intersection_database import read_database, write_database
+from mineloc.io.intersection_database import SCHEMA, is_database, read_database, write_database
 from mineloc.places.database import database_of
 
 GRID = np.array([512_345.678901234, 4_398_765.4321, 2_300.1])
@@ -46,8 +50,8 @@ def some(count: int, seed: int, **names: str) -> IntersectionDatabase:
 
 
 def assert_equal(a: IntersectionDatabase, b: IntersectionDatabase) -> None:
-    assert (a.is_grid, a.map_sha256, a.contour_threshold, a.twins) == (
-        b.is_grid, b.map_sha256, b.contour_threshold, b.twins,
+    assert (a.is_grid, a.lineage, a.contour_threshold, a.twins) == (
+        b.is_grid, b.lineage, b.contour_threshold, b.twins,
     )  # fmt: skip
     for name in ("grid_origin_m", "contour_similarity", "matrix_similarity"):
         assert np.array_equal(getattr(a, name), getattr(b, name))
@@ -65,6 +69,9 @@ def assert_equal(a: IntersectionDatabase, b: IntersectionDatabase) -> None:
 @given(count=st.integers(0, 4), seed=st.integers(0, 1000), name=st.text(max_size=20))
 def test_what_is_written_is_read(tmp_path: Path, count: int, seed: int, name: str) -> None:
     database = some(count, seed, name=name)
+    if seed % 2:
+        line = Lineage(1 + seed, ("cd" * 32, "ef" * 32)[: 1 + seed % 3], 20 + seed, ("ab" * 32, "bc" * 32))
+        database = replace(database, lineage=line)
     write_database(tmp_path / "db.mcap", database, overwrite=True)
     assert_equal(read_database(tmp_path / "db.mcap"), database)
     write_database(tmp_path / "again.mcap", database, overwrite=True)
@@ -97,13 +104,112 @@ def test_a_flipped_bit_is_noticed(tmp_path: Path) -> None:
         assert_equal(found, whole)
 
 
+@pytest.mark.parametrize("length", [1 << 46, 1 << 63])
+def test_a_length_without_sense_is_damage(tmp_path: Path, length: int) -> None:
+    path = tmp_path / "db.mcap"
+    write_database(path, some(2, 5))
+    content, refused = path.read_bytes(), 0
+    whole = read_database(path)
+    for at in range(len(content) - 120, len(content) - 8, 2):
+        path.write_bytes(content[:at] + length.to_bytes(8, "little") + content[at + 8 :])
+        try:
+            assert_equal(read_database(path), whole)
+        except FormatError:
+            refused += 1
+        is_database(path)
+    assert refused > 20
+
+
+def rewritten(path: Path, to: Path, *, schema: str, change: Callable[[str, dict[str, Any]], dict[str, Any]]) -> Path:
+    """The messages of a database under another schema, each changed by topic."""
+    with path.open("rb") as source, to.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        writer.add_metadata(schema, {})
+        for old, channel, message in make_reader(source).iter_messages(log_time_order=False):
+            id = writer.register_channel(
+                channel.topic, "json", writer.register_schema(old.name, old.encoding, old.data)
+            )
+            data = json.dumps(change(channel.topic, json.loads(message.data))).encode()
+            writer.add_message(id, message.log_time, data, message.publish_time, message.sequence)
+        writer.finish()
+    return to
+
+
+def as_version_1(topic: str, message: dict[str, Any]) -> dict[str, Any]:
+    if topic != "/intersections/facts":
+        return message
+    kept = {name: message[name] for name in message if name not in ("version", "parents", "next_id", "maps")}
+    return {**kept, "map_sha256": message["maps"][0]}
+
+
+def test_version_1_is_read_as_the_first_of_its_mine(tmp_path: Path) -> None:
+    whole = some(3, 8)
+    write_database(tmp_path / "db.mcap", whole)
+    old = rewritten(tmp_path / "db.mcap", tmp_path / "old.mcap", schema="mineloc.intersections/1", change=as_version_1)
+    assert_equal(read_database(old), whole)
+    assert read_database(old).lineage == Lineage(1, (), 7, ("ab" * 32,))
+
+
+@pytest.mark.parametrize(
+    ("topic", "changed"),
+    [
+        ("facts", {"map_sha256": "ab"}),
+        ("facts", {"later": 1}),
+        ("records", {"later": 1}),
+        ("facts", {"next_id": 3}),
+        ("facts", {"version": 0}),
+        ("facts", {"version": 2}),
+        ("facts", {"maps": []}),
+        ("facts", {"count": 1}),
+        ("records", {"id": 0}),
+    ],
+)
+def test_what_cannot_be_read_in_full_is_refused(tmp_path: Path, topic: str, changed: dict[str, Any]) -> None:
+    write_database(tmp_path / "db.mcap", some(2, 8))
+    odd = rewritten(
+        tmp_path / "db.mcap",
+        tmp_path / "odd.mcap",
+        schema=SCHEMA,
+        change=lambda on, message: {**message, **changed} if on.endswith(topic) else message,
+    )
+    with pytest.raises(FormatError, match="is damaged"):
+        read_database(odd)
+
+
+def test_a_file_of_one_version_that_says_another_is_refused(tmp_path: Path) -> None:
+    write_database(tmp_path / "db.mcap", some(2, 8))
+    for schema, change in (("mineloc.intersections/1", lambda _, message: message), (SCHEMA, as_version_1)):
+        odd = rewritten(tmp_path / "db.mcap", tmp_path / "odd.mcap", schema=schema, change=change)
+        with pytest.raises(FormatError, match="is damaged"):
+            read_database(odd)
+
+
+def test_a_file_that_ends_early_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "db.mcap"
+    write_database(path, some(2, 5))
+    content = path.read_bytes()
+    for end in np.linspace(0, len(content) - 1, 40).astype(int):
+        path.write_bytes(content[:end])
+        with pytest.raises(FormatError, match="is damaged") as caught:
+            read_database(path)
+        assert "()" not in str(caught.value)
+
+
 def test_what_is_no_database_is_refused_with_a_reason(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="no such file"):
         read_database(tmp_path / "none.mcap")
+    with pytest.raises(FormatError, match="is a folder"):
+        read_database(tmp_path)
     (tmp_path / "text.mcap").write_text("hello")
     with pytest.raises(FormatError, match="damaged"):
         read_database(tmp_path / "text.mcap")
-    for name, expected in (("mineloc.intersections/0", "mineloc.intersections/0"), ("other", "no database")):
+    for name, expected in (
+        ("mineloc.intersections/0", r"holds mineloc\.intersections/0; expected .*/1 or .*/2; make it again"),
+        ("mineloc.intersections/9", r"holds mineloc\.intersections/9; expected .*/1 or .*/2; update mineloc"),
+        ("mineloc.intersections/x", r"holds mineloc\.intersections/x; expected .*/1 or .*/2; make it again"),
+        ("other", "holds no database"),
+    ):
         with (tmp_path / "old.mcap").open("wb") as stream:
             writer = Writer(stream)
             writer.start()

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mineloc.data import Intersection, IntersectionDatabase, Sight, WallContour
+from mineloc.data import Intersection, IntersectionDatabase, Lineage, Sight, WallContour
 from mineloc.errors import FormatError
 from mineloc.io.intersection_files import read_names, with_names, write_csv, write_geojson
 
@@ -29,7 +29,7 @@ def one(id: int, neighbours: tuple[tuple[int, float], ...]) -> Intersection:
 @pytest.fixture
 def database() -> IntersectionDatabase:
     found = (one(0, ((3, 12.5), (3, 40.0))), one(3, ((0, 12.5), (0, 40.0))))
-    return IntersectionDatabase(found, GRID, True, "ab" * 32, np.eye(2), np.eye(2), 0.5, ())
+    return IntersectionDatabase(found, GRID, True, Lineage.first("ab" * 32, (0, 3)), np.eye(2), np.eye(2), 0.5, ())
 
 
 def test_positions_are_exact_in_the_grid(tmp_path: Path, database: IntersectionDatabase) -> None:

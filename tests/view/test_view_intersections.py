@@ -66,7 +66,7 @@ def test_a_database_is_shown_with_all_that_it_knows(database: Path, tmp_path: Pa
 def test_a_database_of_another_version_is_no_flight(database: Path, tmp_path: Path) -> None:
     assert is_database(database)
     content = database.read_bytes()
-    database.write_bytes(content.replace(b"mineloc.intersections/1", b"mineloc.intersections/9"))
+    database.write_bytes(content.replace(b"mineloc.intersections/2", b"mineloc.intersections/9"))
     with pytest.raises(FormatError, match=r"holds mineloc\.intersections/9"):
         show(database, save=tmp_path / "db.rrd", config=Config())
     database.write_bytes(content[:100])
