@@ -110,14 +110,14 @@ def test_a_length_without_sense_is_damage(tmp_path: Path, length: int) -> None:
     write_database(path, some(2, 5))
     content, refused = path.read_bytes(), 0
     whole = read_database(path)
-    for at in range(len(content) - 120, len(content) - 8, 2):
+    for at in range(80, 140):  # the first chunk's record and its sizes
         path.write_bytes(content[:at] + length.to_bytes(8, "little") + content[at + 8 :])
         try:
             assert_equal(read_database(path), whole)
         except FormatError:
             refused += 1
         is_database(path)
-    assert refused > 20
+    assert refused > 30
 
 
 def rewritten(path: Path, to: Path, *, schema: str, change: Callable[[str, dict[str, Any]], dict[str, Any]]) -> Path:
