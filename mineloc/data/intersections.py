@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Literal
 
@@ -169,6 +169,23 @@ class IntersectionDatabase:
         """Of the manifest of its map; of several maps, a name for all of them together."""
         maps = self.lineage.maps
         return maps[0] if len(maps) == 1 else hashlib.sha256("+".join(maps).encode()).hexdigest()
+
+    def in_frame_at(self, grid_origin_m: F64) -> IntersectionDatabase:
+        """The same places in a frame with another origin in the mine grid; both frames have the grid's axes.
+
+        Args:
+            grid_origin_m: (3,) of that frame.
+
+        Raises:
+            ValueError: the origin is another one, and the database is not in the mine grid.
+        """
+        shift = self.grid_origin_m - grid_origin_m
+        if not shift.any():
+            return self
+        if not self.is_grid:
+            raise ValueError("a database that is not in the mine grid")
+        there = tuple(replace(one, point_map=one.point_map + shift) for one in self.intersections)
+        return replace(self, intersections=there, grid_origin_m=grid_origin_m)
 
     def by_id(self, id: int) -> Intersection:
         """The intersection with that id.
