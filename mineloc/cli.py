@@ -152,8 +152,12 @@ def reconstruct(
 
 @app.command()
 def database(
-    source: Annotated[Path, typer.Argument(metavar="MAP", help="A map folder; with --names a database.")],
+    source: Annotated[Path, typer.Argument(metavar="MAP", help="A map folder; with --names or --merge a database.")],
     out: Annotated[Path, typer.Option("--out", help="The database to write (.mcap).")],
+    since: Annotated[
+        Path | None, typer.Option("--since", help="The database before: ids and names of what is still there stay.")
+    ] = None,
+    merge: Annotated[Path | None, typer.Option("--merge", help="A database of another part, in one grid.")] = None,
     names: Annotated[Path | None, typer.Option("--names", help="Its CSV with edited names and kinds.")] = None,
     csv: Annotated[Path | None, typer.Option("--csv", help="Also write a table.")] = None,
     geojson: Annotated[Path | None, typer.Option("--geojson", help="Also write points and ways.")] = None,
@@ -165,8 +169,15 @@ def database(
     from mineloc.config import load_config
     from mineloc.stages import database as stage
 
+    if sum(one is not None for one in (since, merge, names)) > 1:
+        raise typer.BadParameter("one of --since, --merge and --names")
     settings = load_config(config, overrides or ())
-    result = stage.rename(source, names, out) if names else stage.database(source, out, config=settings)
+    if names is not None:
+        result = stage.rename(source, names, out)
+    elif merge is not None:
+        result = stage.merge(source, merge, out, config=settings)
+    else:
+        result = stage.database(source, out, since=since, config=settings)
     stage.export(out, csv=csv, geojson=geojson)
     if as_json:
         sys.stdout.write(json.dumps(result.to_dict(), indent=1) + "\n")

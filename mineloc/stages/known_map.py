@@ -30,7 +30,7 @@ class KnownMap:
         prior: for methods.
         grid_origin_m: (3,) of its frame in the mine grid.
         is_grid: whether it stands in the mine grid.
-        map_sha256: of the manifest of the map.
+        map_sha256: of the manifest of the map; of a merged database alone, of all its maps together.
     """
 
     prior: Prior
@@ -50,7 +50,7 @@ class KnownMap:
         known = None if database is None else read_database(database)
         if survey is not None:
             digest = hashlib.sha256((survey.path / "manifest.json").read_bytes()).hexdigest()
-            if known is not None and known.map_sha256 != digest:
+            if known is not None and digest not in known.lineage.maps:
                 raise ConfigError(
                     str(database),
                     "is of another map",
@@ -58,6 +58,8 @@ class KnownMap:
                     todo="make it of this map",
                 )
             origin, is_grid = survey.grid_origin_m, bool(survey.manifest["frame"]["is_grid"])
+            # a merged database stands in the frame of one of its maps, which need not be this one
+            known = None if known is None else known.in_frame_at(origin)
         elif known is not None:
             digest, origin, is_grid = known.map_sha256, known.grid_origin_m, known.is_grid
         else:

@@ -90,11 +90,12 @@ def about_map(survey: MapFolder, origin_m: F64) -> str:
 def about_database(known: IntersectionDatabase, origin_m: F64) -> str:
     """Markdown of a database of intersections: a row each, in the order of the similarity pictures."""
     twins = ", ".join(f"{a} and {b}" for a, b in known.twins) or "none"
+    maps = " and ".join(escaped(one[:12]) for one in known.lineage.maps)
     lines = [
         "# Intersections",
         "",
-        f"{len(known)} of map {escaped(known.map_sha256[:12])}. Contours more alike than {known.contour_threshold:.2f} "
-        f"may be one place. Twins: {twins}.",
+        f"Version {known.lineage.version}: {len(known)} of map {maps}. "
+        f"Contours more alike than {known.contour_threshold:.2f} may be one place. Twins: {twins}.",
         "",
         "| row | id | name | kind | branches (°) | neighbours | quality |",
         "| --- | --- | --- | --- | --- | --- | --- |",
