@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, cast
 
-from pydantic import Field
+from pydantic import Field, ValidationInfo, field_validator
 
 from mineloc.config.section import Section
 
@@ -44,6 +44,15 @@ class SimulateConfig(Section):
     machine: bool = Field(default=False, description="a loader drives ahead of the drone")
     roadway_width_m: float = Field(default=4.0, ge=1.5, le=30, description="of plans that do not tell (DXF)")
     roadway_height_m: float = Field(default=3.2, ge=1.8, le=30, description="of plans that do not tell (DXF)")
+    closed: tuple[tuple[float, float, float, float], ...] = Field(
+        default=(),
+        description="walls since the mine was mapped: [x_m, y_m, z_m, bearing_deg], in its frame and in a roadway, and "
+        "the bearing of that roadway, counter-clockwise from x",
+    )
+    widened: tuple[tuple[float, float, float, float, float], ...] = Field(
+        default=(),
+        description="places widened since: [x_m, y_m, z_m, radius_m, by_m]: what is within radius_m moves away by by_m",
+    )
     imu_hz: float = Field(default=200.0, ge=50, le=1000)
     gyro_noise_degps_rthz: float = Field(default=0.007, ge=0)
     gyro_bias_degps: float = Field(default=0.2, ge=0)
@@ -72,3 +81,25 @@ class SimulateConfig(Section):
     )
     depth_range_m: float = Field(default=8.0, gt=0, description="half of the pixels are lost at this depth")
     depth_holes: float = Field(default=0.01, ge=0, lt=1, description="share of pixels lost by chance")
+
+    @field_validator("closed", "widened", mode="before")
+    @classmethod
+    def _lists_of_places(cls, value: object, info: ValidationInfo) -> object:
+        """Say what the numbers are: one list for one place is the likely slip, and no schema tells what is missing."""
+        names = ["x_m", "y_m", "z_m", *(["bearing_deg"] if info.field_name == "closed" else ["radius_m", "by_m"])]
+        if not isinstance(value, list | tuple) or not all(
+            isinstance(place, list | tuple) and len(cast("list[object]", place)) == len(names)
+            for place in cast("list[object]", value)
+        ):
+            raise ValueError(f"a list of [{', '.join(names)}], in double brackets even for one place")
+        return cast("object", value)
+
+    @field_validator("widened")
+    @classmethod
+    def _gently_widened(
+        cls, value: tuple[tuple[float, float, float, float, float], ...]
+    ) -> tuple[tuple[float, float, float, float, float], ...]:
+        """More than a quarter of the radius, and the rock would fold over."""
+        if not all(0 < by_m <= radius_m / 4 for *_, radius_m, by_m in value):
+            raise ValueError("by_m over 0 and at most a quarter of radius_m")
+        return value

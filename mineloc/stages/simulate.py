@@ -14,6 +14,7 @@ from mineloc.io import control_points as survey_files
 from mineloc.io.flight import FlightWriter
 from mineloc.progress import Progress, quiet
 from mineloc.sim.camera_mount import camera_model
+from mineloc.sim.changes import CHANGES_FILE, changed_mine, changes_json
 from mineloc.sim.flight import TRUTH_NS, Packet, SimulatedFlight
 from mineloc.sim.mine import load_mine
 from mineloc.sim.tag_camera import TagCamera
@@ -68,7 +69,7 @@ def simulate(
         out: the flight file.
         graph: roadway graph (JSON) of a mesh, instead of the one found in it.
         start: node of the roadway graph to start from.
-        config: tour, drone, sensors and their errors in `simulate`.
+        config: tour, drone, sensors and their errors in `simulate`, and what of the mine has changed.
         progress: told after each sweep.
 
     Raises:
@@ -83,6 +84,7 @@ def simulate(
         roadway_width_m=settings.roadway_width_m,
         roadway_height_m=settings.roadway_height_m,
     )
+    site = changed_mine(site, closed=settings.closed, widened=settings.widened)
     flight = SimulatedFlight(site, settings, start=start)
     counts, path_m = _write(flight, out, progress)
     return SimulateResult(
@@ -108,6 +110,8 @@ def _write(flight: SimulatedFlight, out: Path, progress: Progress) -> tuple[Coun
     with FlightWriter(out, flight.info, flight.calibration) as writer:
         if survey is not None:
             _attach(survey, writer)
+        if (changes := changes_json(flight.config)) is not None:
+            writer.add_attachment(CHANGES_FILE, "application/json", changes)
         tags = _tag_camera(flight, survey)
         for done, packet in enumerate(flight.packets(), start=1):
             # images before the sweep: it ends later than they were taken
