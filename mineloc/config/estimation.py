@@ -121,5 +121,8 @@ class GraphConfig(Section):
     relative_max_deg: float = Field(default=20.0, gt=0, description="no motion between keyframes is known less")
     robust: bool = Field(default=True, description="Cauchy kernel on fixes and loops")
     cauchy_k: float = Field(default=1.0, gt=0, description="in standard deviations of a residual component")
+    outvote_probability: float = Field(
+        default=0.999, gt=0, lt=1, description="of right recognitions that odometry and the others keep"
+    )
     max_iterations: int = Field(default=100, ge=1)
     relinearize_threshold: float = Field(default=0.01, gt=0, description="metres or radians; causal estimate")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field, PositiveFloat
 
 from mineloc.config.section import Section
@@ -24,6 +26,7 @@ class IntersectionsConfig(Section):
     min_branch_m: float = Field(default=1.2, gt=0, description="least width of a branch")
     max_turn_deg: float = Field(default=22.0, gt=0, description="of a branch's bearing from ring to ring")
     apart_m: float = Field(default=3.0, gt=0, description="two intersections are at least so far apart")
+    merge_m: float = Field(default=4.0, gt=0, description="nearer junctions of a map are one (METHOD 5.4)")
     centre_weight: float = Field(default=0.05, gt=0, description="of the clearance maximum in the invariant point")
     contour_radius_m: float = Field(default=8.0, gt=0)
     contour_bins: int = Field(default=180, ge=36)
@@ -42,6 +45,21 @@ class IntersectionsConfig(Section):
     peak_drop: float = Field(default=0.15, ge=0, le=1, description="turns so much less alike are tried too")
     matrix_margin: float = Field(default=0.05, ge=0, le=1, description="by which a matrix must fit better")
     same_needed: int = Field(default=3, ge=1, description="keyframes in a row that see the same intersection")
+    threshold_known: float = Field(
+        default=0.5, ge=0, le=1, description="least contour similarity where the pose leaves few to choose from"
+    )
+    same_needed_known: int = Field(default=2, ge=1, description="keyframes in a row where the pose is known")
+    max_candidates: int = Field(default=6, ge=1, description="that matrices are compared of")
+    completeness_limit: float = Field(
+        default=10.0, ge=1, description="by which a partly seen intersection's covariance grows at most (METHOD D4)"
+    )
+    factor: Literal["pose", "position"] = Field(
+        default="pose", description="what a recognition says: the drone's pose, or the place of the point (paper A)"
+    )
+    found_needed: int = Field(default=2, ge=1, description="intersections by which a flight from anywhere is found")
+    sequence_share: float = Field(
+        default=0.9, ge=0, le=1, description="of the shortest way between two intersections that must be flown"
+    )
     verify_radius_m: float = Field(default=12.0, gt=0, description="points around the intersection that are registered")
     verify_inlier_ratio: float = Field(default=0.7, gt=0, le=1)
     verify_residual_m: float = Field(default=0.06, gt=0)

@@ -123,8 +123,9 @@ class Fix:
         covariance: (6, 6) `[rotation, translation]`, right perturbation; None without a pose.
         trusted: whether it may enter the graph.
         reason: the step that refused and its number; empty when trusted.
-        target: what was recognised (intersection id), empty when none.
+        target: what was recognised (name of the intersection), empty when none.
         scores: every number that the decision used, by name.
+        point_map: (3,) the known point that was recognised, an intersection's invariant point; None without one.
     """
 
     stamp_ns: int
@@ -135,6 +136,7 @@ class Fix:
     reason: str = ""
     target: str = ""
     scores: Mapping[str, float] = field(default_factory=dict)
+    point_map: F64 | None = None
 
     def __post_init__(self) -> None:
         need(self.trusted or bool(self.reason), "a refused fix must say why")

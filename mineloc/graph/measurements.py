@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mineloc import se3
 from mineloc.data import F64, Fix
 
 
@@ -32,12 +33,23 @@ class PointFix:
 
     @staticmethod
     def of(fix: Fix) -> PointFix:
-        """Only the position of a fix: the lidar itself is the point (METHOD D8).
+        """Only the place of what a fix recognised; without a point the lidar itself is the point.
+
+        The sighting is where registration puts the point, and its covariance is the projection of the registration's
+        (METHOD D8, D20): what paper A's eq. 29-31 mean.
 
         Raises:
             ValueError: the fix has no pose or no covariance.
         """
         if fix.T_map_lidar is None or fix.covariance is None:
             raise ValueError("a fix without pose or covariance")
-        r = fix.T_map_lidar[:3, :3]
-        return PointFix(fix.keyframe, fix.T_map_lidar[:3, 3], np.zeros(3), r @ fix.covariance[3:, 3:] @ r.T)
+        point = fix.T_map_lidar[:3, 3] if fix.point_map is None else fix.point_map
+        seen = se3.apply(se3.inverse(fix.T_map_lidar), point[None])[0]
+        J = point_jacobian(fix.T_map_lidar, seen)
+        covariance = J @ fix.covariance @ J.T
+        return PointFix(fix.keyframe, point, seen, 0.5 * (covariance + covariance.T))
+
+
+def point_jacobian(T_map_lidar: F64, point_lidar: F64) -> F64:
+    """(3, 6) of a point's place in the map by the pose, `[rotation, translation]`, right perturbation (METHOD D3)."""
+    return T_map_lidar[:3, :3] @ np.hstack([-se3.hat(point_lidar), np.eye(3)])

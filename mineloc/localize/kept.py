@@ -22,7 +22,7 @@ class Kept:
         clock: seconds by module.
         steps: one a sweep, without points.
         keyframes, edges: nodes and what leads to each, None for the first.
-        online: (4, 4) `T_map_lidar` of each sweep as known at the time.
+        online: (4, 4) `T_map_lidar` of each sweep as known at the time, from the `online_from`-th on.
     """
 
     clock: Clock = field(default_factory=Clock)
@@ -30,6 +30,7 @@ class Kept:
     keyframes: list[Keyframe] = field(default_factory=list[Keyframe])
     edges: list[RelativePose | None] = field(default_factory=list[RelativePose | None])
     online: list[F64] = field(default_factory=list[F64])
+    online_from: int = 0
 
     def add_keyframe(self, step: OdometryStep) -> Keyframe:
         """Keep the keyframe of a step, which has one."""
@@ -43,6 +44,11 @@ class Kept:
         self.online.append(T_map_odom @ step.T_odom_lidar)
         self.steps.append(without_points(step))
 
+    def forget_online(self) -> None:
+        """Where the drone was told to be so far was not in the map."""
+        self.online.clear()
+        self.online_from = len(self.steps)
+
     def told(
         self,
         solution: Solution,
@@ -50,13 +56,14 @@ class Kept:
         counts: Mapping[str, int],
         loops: Sequence[RelativePose] = (),
         fixes: Sequence[Fix] = (),
+        in_map: bool = True,
     ) -> Localization:
         """The answer: the smoothed keyframes spread over all sweeps."""
         stamps = np.array([step.stamp_ns for step in self.steps])
         odometry = Trajectory(stamps, np.stack([s.T_odom_lidar for s in self.steps]), parent="odom", child="lidar")
         return Localization(
             smoothed=spread(odometry, np.array([k.stamp_ns for k in self.keyframes]), solution.poses),
-            online=Trajectory(stamps, np.stack(self.online), child="lidar"),
+            online=Trajectory(stamps[self.online_from :], np.stack(self.online), child="lidar"),
             steps=self.steps,
             keyframes=self.keyframes,
             edges=self.edges,
@@ -66,4 +73,5 @@ class Kept:
             fixes=fixes,
             counts=counts,
             seconds=dict(self.clock.seconds),
+            in_map=in_map,
         )

@@ -31,7 +31,8 @@ class Localization:
     """The answer of a method.
 
     Attributes:
-        smoothed, online: `T_map_lidar`, one pose a sweep; `online` as known at that time.
+        smoothed, online: `T_map_lidar`, one pose a sweep; `online` as known at that time, from where the flight was
+            found in the map on.
         steps: what the front end said, one a sweep, without keyframe points.
         keyframes: nodes of the graph; `keyframe_poses` (k, 4, 4) their smoothed `T_map_lidar`, `covariances`
             (k, 6, 6) `[rotation, translation]`, right perturbation.
@@ -40,6 +41,7 @@ class Localization:
         fixes: recognitions, accepted or refused.
         counts: what the front end counted, by name.
         seconds: by module, one entry a call.
+        in_map: False where a flight never found itself in the map: then all poses are in a frame of its own.
     """
 
     smoothed: Trajectory
@@ -53,6 +55,7 @@ class Localization:
     fixes: Sequence[Fix]
     counts: Mapping[str, int]
     seconds: dict[str, list[float]]
+    in_map: bool = True
 
 
 @dataclass(slots=True)

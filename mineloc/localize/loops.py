@@ -8,7 +8,7 @@ loop is worse than no loop: what is refused says why.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,6 +19,7 @@ from mineloc.data import F64, Fix, Keyframe, RelativePose
 from mineloc.graph.relative_uncertainty import Prediction, RelativeUncertainty
 from mineloc.localize.keyframe_clouds import context_of, levelled, submap_around
 from mineloc.localize.loop_judgement import Judgement, judge_loop
+from mineloc.localize.visits import Visit, Visits
 from mineloc.mapping.coarse_match import match_coarsely
 from mineloc.mapping.submap_registration import SubmapRegistration, register_submaps
 from mineloc.mapping.submaps import Submap
@@ -33,7 +34,7 @@ class Candidate:
 
     Attributes:
         T_i_j: (4, 4) where registration may start; None: where the prediction says.
-        source: "place" or "position".
+        source: "place", "position" or "intersection".
         scores: of the search.
     """
 
@@ -59,18 +60,21 @@ class LoopCloser:
     """Watches a flight go by and says where it meets itself.
 
     Args:
-        config: sections `loops`, `scan_context`, `graph`.
+        config: sections `loops`, `scan_context`, `graph`, `intersections`.
         by_place: candidates by Scan Context.
         by_position: candidates by the estimated position.
+        by_intersection: candidates by intersections that were seen before (paper A without a map).
 
     Attributes:
         loops: accepted so far, in the order of acceptance.
     """
 
-    def __init__(self, config: Config, *, by_place: bool, by_position: bool) -> None:
+    def __init__(self, config: Config, *, by_place: bool, by_position: bool, by_intersection: bool = False) -> None:
         self._config, self._loops_config = config, config.loops
         self._by_position = by_position
         self._contexts = ContextIndex(config.scan_context) if by_place else None
+        self._visits = Visits(config.intersections) if by_intersection else None
+        self._waiting: list[Visit] = []
         self._uncertainty = RelativeUncertainty(config.graph)
         self._keyframes: list[Keyframe] = []
         self._poses: list[F64] = []
@@ -104,11 +108,12 @@ class LoopCloser:
         if self._contexts is not None:
             context = context_of(keyframe, T_map_lidar, self._config.scan_context)
             self._contexts.add(context, path_m=self._path_m[-1])
+        found = self._revisited(keyframe)
         j = len(self._keyframes) - 1 - self._loops_config.submap_keyframes
         if j < 0 or self._path_m[j] < self._searched_m + self._loops_config.every_m:
-            return []
+            return found
         self._searched_m = self._path_m[j]
-        return self.search(j)
+        return [*found, *self.search(j)]
 
     def pose(self, index: int) -> F64:
         """(4, 4) `T_map_lidar` of a keyframe as it is believed now."""
@@ -137,10 +142,35 @@ class LoopCloser:
 
     def search(self, j: int) -> list[RelativePose]:
         """Candidates for one keyframe, examined; all closures that are accepted because of it."""
+        return self._closed(self._candidates(j))
+
+    def _revisited(self, keyframe: Keyframe) -> list[RelativePose]:
+        """Closures by intersections: of each visit that is over, once its submaps are complete."""
+        if self._visits is None:
+            return []
+        visit = self._visits.follow(keyframe)
+        if visit is not None:
+            self._waiting.append(visit)
+        complete = len(self._keyframes) - 1 - self._loops_config.submap_keyframes
+        ready = [one for one in self._waiting if one.keyframes[-1] <= complete]
+        self._waiting = [one for one in self._waiting if one.keyframes[-1] > complete]
+        return [loop for one in ready for root in one.roots for loop in self._closed(self._seen_before(one, root))]
+
+    def _seen_before(self, visit: Visit, root: int) -> Iterator[Candidate]:
+        """One keyframe of a visit against those of earlier visits that look alike."""
+        assert self._visits is not None
+        to_root = se3.inverse(self._keyframes[visit.keyframe].T_odom_lidar) @ self._keyframes[root].T_odom_lidar
+        for seen in self._visits.like(visit):
+            i = seen.earlier.keyframe
+            if self._path_m[root] - self._path_m[i] >= self._loops_config.min_path_m:
+                T_i_j = se3.rigid(seen.T_earlier_here @ to_root)
+                yield Candidate(i, root, "intersection", T_i_j, {"similarity": seen.similarity})
+
+    def _closed(self, candidates: Iterable[Candidate]) -> list[RelativePose]:
         accepted: list[RelativePose] = []
         registered = 0
         closed: set[int] = set()
-        for candidate in self._candidates(j):
+        for candidate in candidates:
             if registered == self._loops_config.max_candidates:
                 break
             # earlier passes of one flight are closed with each other: a second closure says nothing new

@@ -7,23 +7,29 @@ from typing import Protocol
 
 import numpy as np
 
-from mineloc.config import PriorMapConfig
-from mineloc.data import F64, Fix, Keyframe, RelativePose
+from mineloc.config import Config
+from mineloc.data import Fix, Keyframe, RelativePose
+from mineloc.graph.measurements import PointFix
 from mineloc.localize.pose_filter import PoseFilter
 from mineloc.localize.prior_map import PriorMap
 from mineloc.localize.recognition import Recognizer
+from mineloc.localize.sequence import RoadwaySequence
 
 
 class Tracker(Protocol):
-    """Follows a flight through a map.
+    """Follows a flight through a map."""
 
-    Attributes:
-        filter: pose and covariance at the newest keyframe.
-    """
+    @property
+    def filter(self) -> PoseFilter | None:
+        """Pose and covariance at the newest keyframe; None while the flight is not found in the map."""
+        ...
 
-    filter: PoseFilter
+    @property
+    def fixes(self) -> list[Fix]:
+        """Of all keyframes so far; those of a flight that was lost are judged when it is found."""
+        ...
 
-    def follow(self, keyframe: Keyframe, edge: RelativePose | None) -> Fix:
+    def follow(self, keyframe: Keyframe, edge: RelativePose | None) -> None:
         """Carry the pose to the next keyframe and correct it by what is seen there.
 
         Args:
@@ -38,16 +44,16 @@ class MapTracker:
 
     Args:
         prior_map: of the mine.
-        config: gates and noise.
-        T_map_lidar: (4, 4) of the first keyframe.
-        covariance: (6, 6) of that, `[rotation, translation]`, right perturbation.
+        config: section `prior_map`: gates and noise.
+        known: where the first keyframe is.
     """
 
-    def __init__(self, prior_map: PriorMap, config: PriorMapConfig, *, T_map_lidar: F64, covariance: F64) -> None:
-        self._map, self._config = prior_map, config
-        self.filter = PoseFilter(T_map_lidar, covariance)
+    def __init__(self, prior_map: PriorMap, config: Config, known: PoseFilter) -> None:
+        self._map, self._config = prior_map, config.prior_map
+        self.filter: PoseFilter = known
+        self.fixes: list[Fix] = []
 
-    def follow(self, keyframe: Keyframe, edge: RelativePose | None) -> Fix:
+    def follow(self, keyframe: Keyframe, edge: RelativePose | None) -> None:
         """As `Tracker.follow`."""
         if edge is not None:
             self.filter.carry(edge)
@@ -75,7 +81,7 @@ class MapTracker:
         )
         if fix.trusted:
             self.filter.correct(fix)
-        return fix
+        self.fixes.append(fix)
 
 
 class IntersectionTracker:
@@ -83,32 +89,44 @@ class IntersectionTracker:
 
     Args:
         recognizer: of the mine's intersections.
-        config: gates.
-        T_map_lidar, covariance: as for `MapTracker`.
+        sequence: which of them can follow which.
+        config: sections `prior_map`: gates, `intersections`: which factor.
+        known: where the first keyframe is.
     """
 
-    def __init__(self, recognizer: Recognizer, config: PriorMapConfig, *, T_map_lidar: F64, covariance: F64) -> None:
-        self._recognizer, self._config = recognizer, config
-        self.filter = PoseFilter(T_map_lidar, covariance)
+    def __init__(self, recognizer: Recognizer, sequence: RoadwaySequence, config: Config, known: PoseFilter) -> None:
+        self._recognizer, self._sequence, self._config = recognizer, sequence, config
+        self.filter: PoseFilter = known
+        self.fixes: list[Fix] = []
 
-    def follow(self, keyframe: Keyframe, edge: RelativePose | None) -> Fix:
+    def follow(self, keyframe: Keyframe, edge: RelativePose | None) -> None:
         """As `Tracker.follow`."""
         if edge is not None:
             self.filter.carry(edge)
-        fix = self._recognizer.follow(keyframe, self._is_possible)
-        if not fix.trusted or fix.T_map_lidar is None:
-            return fix
-        c = self._config
+            self._sequence.carry(edge)
+        fix = self._recognizer.follow(keyframe, self.filter)
+        if fix.trusted:
+            fix = self._judged(fix)
+        if fix.trusted:
+            self._sequence.accept(fix)
+            correct_by(self.filter, fix, self._config)
+        self.fixes.append(fix)
+
+    def _judged(self, fix: Fix) -> Fix:
+        """Against what odometry expects and the roadways allow."""
+        assert fix.T_map_lidar is not None
+        c = self._config.prior_map
         sigmas = self.filter.sigmas_away(fix.T_map_lidar, floor_m=c.moved_floor_m, floor_deg=c.moved_floor_deg)
         fix = replace(fix, scores={**fix.scores, "sigmas": sigmas})
+        reason = self._sequence.doubt(fix)
         if sigmas > c.max_moved_sigmas:
-            reason = f"{sigmas:.1f} sigmas from the prediction, at most {c.max_moved_sigmas} allowed"
-            return replace(fix, trusted=False, reason=reason)
-        self.filter.correct(fix)
-        return fix
+            reason = f"{sigmas:.1f} sigmas from the prediction, at most {c.max_moved_sigmas} allowed (step 9)"
+        return replace(fix, trusted=False, reason=reason) if reason else fix
 
-    def _is_possible(self, T_map_lidar: F64) -> bool:
-        """Before registration: an invariant point is known to some decimetres, its turn to some degrees."""
-        c = self._config
-        sigmas = self.filter.sigmas_away(T_map_lidar, floor_m=c.seen_floor_m, floor_deg=c.seen_floor_deg)
-        return sigmas <= c.max_moved_sigmas
+
+def correct_by(known: PoseFilter, fix: Fix, config: Config) -> None:
+    """Take a recognised intersection by the factor that the configuration names."""
+    if config.intersections.factor == "position":
+        known.correct_by_point(PointFix.of(fix))
+    else:
+        known.correct(fix)

@@ -11,16 +11,24 @@ from mineloc import se3
 from mineloc.config import Config, PriorMapConfig
 from mineloc.data import F64, Fix, IntersectionDatabase, OdometryStep
 from mineloc.errors import ConfigError
-from mineloc.graph.batch import solve
+from mineloc.graph.batch import Solution, solve
+from mineloc.graph.condensed import outvoted_fixes
+from mineloc.graph.measurements import PointFix
 from mineloc.graph.pose_graph import PoseGraph
 from mineloc.localize.flown import counts_of, first_origin, front_end_steps
 from mineloc.localize.kept import Kept
 from mineloc.localize.localization import FlightData, Localization
 from mineloc.localize.map_tracker import IntersectionTracker, MapTracker, Tracker
+from mineloc.localize.pose_filter import PoseFilter
 from mineloc.localize.prior_map import PriorMap
 from mineloc.localize.recognition import Recognizer
+from mineloc.localize.relocalization import Relocalizer
+from mineloc.localize.sequence import RoadwaySequence
 from mineloc.odometry.front_end import FrontEnd
 from mineloc.progress import Progress
+
+By = Literal["map", "intersections"]
+_ANYWHERE_RAD, _ANYWHERE_M = np.radians(30.0), 100.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,32 +63,53 @@ class Prior:
     """What is known before a flight.
 
     Attributes:
-        start: where the flight begins in the map.
+        start: where the flight begins in the map; None: anywhere, and intersections find it.
         map: of the mine, for `map_tracking`.
-        database: of its intersections, for `intersections_map`.
+        database: of its intersections, for `intersections_map` and for flights that begin anywhere.
     """
 
-    start: Start
+    start: Start | None
     map: PriorMap | None = None
     database: IntersectionDatabase | None = None
 
-    def tracker(self, config: Config, T_map_lidar: F64, *, by: Literal["map", "intersections"]) -> Tracker:
-        """What follows a flight that begins at a pose.
+    def check(self, by: By) -> None:
+        """Whether there is what a method needs.
 
         Raises:
-            ConfigError: what it needs is not there.
+            ConfigError: there is not.
         """
-        covariance = self.start.covariance
-        if by == "map":
-            if self.map is None:
-                raise ConfigError("--method", "the method needs a map", expected="--map MAP/", todo="name a map folder")
-            return MapTracker(self.map, config.prior_map, T_map_lidar=T_map_lidar, covariance=covariance)
-        if self.database is None:
+        if by == "map" and self.map is None:
+            raise ConfigError("--method", "the method needs a map", expected="--map MAP/", todo="name a map folder")
+        if by == "intersections" and self.database is None:
             raise ConfigError(
                 "--method", "the method needs a database", expected="--database DB.mcap", todo="make one of a map"
             )
-        recognizer = Recognizer(config, self.database)
-        return IntersectionTracker(recognizer, config.prior_map, T_map_lidar=T_map_lidar, covariance=covariance)
+        if self.start is None and self.database is None:
+            raise ConfigError(
+                "prior_map.start_m",
+                "is not set",
+                expected="where the drone begins, in the frame of the map, or a database to find it by",
+                todo="set it and prior_map.start_yaw_deg, or give --database",
+            )
+
+    def tracker(self, config: Config, T_map_lidar: F64, *, by: By) -> Tracker:
+        """What follows a flight.
+
+        Args:
+            T_map_lidar: (4, 4) of its first keyframe, where the start is known.
+        """
+        if self.start is not None:
+            return self._track(config, PoseFilter(T_map_lidar, self.start.covariance, config.graph), by)
+        assert self.database is not None
+        return Relocalizer(Recognizer(config, self.database), config, lambda known: self._track(config, known, by))
+
+    def _track(self, config: Config, known: PoseFilter, by: By) -> Tracker:
+        if by == "map":
+            assert self.map is not None
+            return MapTracker(self.map, config, known)
+        assert self.database is not None
+        sequence = RoadwaySequence(self.database, config.intersections)
+        return IntersectionTracker(Recognizer(config, self.database), sequence, config, known)
 
 
 class MapTracking:
@@ -91,22 +120,24 @@ class MapTracking:
         front_end: turns sweeps into poses.
         prior: what is known, and where the flight begins in it.
         by: what holds the drone.
+
+    Raises:
+        ConfigError: the prior lacks what it needs.
     """
 
-    def __init__(
-        self, config: Config, front_end: FrontEnd, prior: Prior, *, by: Literal["map", "intersections"]
-    ) -> None:
+    def __init__(self, config: Config, front_end: FrontEnd, prior: Prior, *, by: By) -> None:
         self._config, self._front_end = config, front_end
-        self._by: Literal["map", "intersections"] = by
-        self._prior, self._start = prior, prior.start
-        self._graph = PoseGraph(config.graph)
+        self._by: By = by
+        prior.check(by)
+        self._prior = prior
         self._kept = Kept()
         self._tracker: Tracker | None = None
-        self._fixes: list[Fix] = []
-        self._T_map_odom: F64 = np.eye(4)  # as known now
+        self._T_map_odom: F64 = np.eye(4)  # as known now; of a frame of its own while the flight is not found
+        self._origin: F64 = np.eye(4)  # the same at the start
+        self._found = prior.start is not None
 
     def run(self, flight: FlightData, progress: Progress) -> Localization:
-        """Every sweep through the front end, every keyframe to the map and into the graph, then all at once.
+        """Every sweep through the front end, every keyframe to the map, then all at once.
 
         Raises:
             FlightError: fewer than two sweeps, none with points, or time goes backwards.
@@ -114,27 +145,64 @@ class MapTracking:
         clock = self._kept.clock
         for step in front_end_steps(self._front_end, flight, self._config, clock=clock, progress=progress):
             if not self._kept.steps:
-                self._T_map_odom = self._start.T_map_level @ first_origin(step, flight.calibration.T_body_lidar)
+                start = np.eye(4) if self._prior.start is None else self._prior.start.T_map_level
+                self._origin = self._T_map_odom = start @ first_origin(step, flight.calibration.T_body_lidar)
             if step.keyframe is not None:
                 with clock.of(self._by):
                     self._place(step)
             self._kept.add_step(step, self._T_map_odom)
-        with clock.of("graph_batch"):
-            solution = solve(self._graph)
-        return self._kept.told(solution, counts=counts_of(self._front_end), fixes=self._fixes)
+        return self._smoothed()
 
     def _place(self, step: OdometryStep) -> None:
-        """Register a keyframe; what it says moves all that comes after it."""
+        """Show a keyframe to the tracker; what it says moves all that comes after it."""
         keyframe = self._kept.add_keyframe(step)
-        expected = self._T_map_odom @ keyframe.T_odom_lidar
-        if step.relative_pose is None:
-            self._graph.add_first(keyframe, T_map_lidar=expected, covariance=self._start.covariance)
-        else:
-            self._graph.add_next(keyframe, step.relative_pose)
         if self._tracker is None:
+            expected = self._T_map_odom @ keyframe.T_odom_lidar
             self._tracker = self._prior.tracker(self._config, expected, by=self._by)
-        fix = self._tracker.follow(keyframe, step.relative_pose)
-        self._fixes.append(fix)
-        if fix.trusted:
-            self._graph.add_fix(fix)
-        self._T_map_odom = self._tracker.filter.T_map_lidar @ se3.inverse(keyframe.T_odom_lidar)
+        self._tracker.follow(keyframe, step.relative_pose)
+        known = self._tracker.filter
+        if known is None:
+            return
+        if not self._found:
+            # what was told of the drone before was not in the map
+            self._found = True
+            self._kept.forget_online()
+        self._T_map_odom = known.T_map_lidar @ se3.inverse(keyframe.T_odom_lidar)
+
+    def _smoothed(self) -> Localization:
+        assert self._tracker is not None
+        with self._kept.clock.of("graph_batch"):
+            fixes = self._agreed(self._tracker.fixes)
+            solution = self._solved(fixes)
+        counts = counts_of(self._front_end)
+        return self._kept.told(solution, counts=counts, fixes=fixes, in_map=self._found)
+
+    def _agreed(self, fixes: list[Fix]) -> list[Fix]:
+        """Recognitions that the others outvote are refused; one wrong id must not bend the trajectory."""
+        if self._by == "map" or not self._found:
+            return fixes
+        return outvoted_fixes(self._kept.keyframes, self._kept.edges, fixes, self._config.graph)
+
+    def _solved(self, fixes: list[Fix]) -> Solution:
+        graph = PoseGraph(self._config.graph)
+        for keyframe, edge in zip(self._kept.keyframes, self._kept.edges, strict=True):
+            if edge is not None:
+                graph.add_next(keyframe, edge)
+                continue
+            T_map_odom, covariance = self._first()
+            graph.add_first(keyframe, T_map_lidar=T_map_odom @ keyframe.T_odom_lidar, covariance=covariance)
+        by_point = self._by == "intersections" and self._config.intersections.factor == "position"
+        for fix in fixes:
+            if fix.trusted and by_point:
+                graph.add_point_fix(PointFix.of(fix))
+            elif fix.trusted:
+                graph.add_fix(fix)
+        return solve(graph)
+
+    def _first(self) -> tuple[F64, F64 | None]:
+        """`T_map_odom` of the start and the covariance there: as given, as found later, or of a frame of its own."""
+        if self._prior.start is not None:
+            return self._origin, self._prior.start.covariance
+        if not self._found:
+            return self._origin, None
+        return self._T_map_odom, np.diag([_ANYWHERE_RAD**2] * 3 + [_ANYWHERE_M**2] * 3)

@@ -42,21 +42,27 @@ class Method:
         front_end: its name, as the result row tells it.
         make_front_end: from configuration and calibration.
         summary: one line for people.
-        loops: where loop closures come from: "place" (Scan Context), "position" (the estimate), both or none.
+        loops: where loop closures come from: "place" (Scan Context), "position" (the estimate), "intersection" (one
+            that was seen before); several or none.
         tracks: what of a prior map it localizes by.
     """
 
     front_end: str
     make_front_end: Callable[[Config, Calibration], FrontEnd]
     summary: str
-    loops: frozenset[Literal["place", "position"]] = frozenset()
+    loops: frozenset[Literal["place", "position", "intersection"]] = frozenset()
     tracks: Literal["map", "intersections"] | None = None
 
     def closer(self, config: Config) -> LoopCloser | None:
         """What finds the method's loop closures, None for an open-loop method."""
         if not self.loops:
             return None
-        return LoopCloser(config, by_place="place" in self.loops, by_position="position" in self.loops)
+        return LoopCloser(
+            config,
+            by_place="place" in self.loops,
+            by_position="position" in self.loops,
+            by_intersection="intersection" in self.loops,
+        )
 
     def run(
         self, flight: FlightData, config: Config, *, prior: Prior | None = None, progress: Progress = quiet
@@ -93,6 +99,12 @@ METHODS: dict[str, Method] = {
     "link3d": Method("link3d", _link3d, "LOAM whose edges LinK3D gathers (paper B), no loop closures"),
     "link3d_scan_context": Method(
         "link3d", _link3d, "paper B: LinK3D and Scan Context loop closures", frozenset({"place"})
+    ),
+    "intersections": Method(
+        "mineloc",
+        _mineloc,
+        "paper A without a map: an intersection seen again, from any side, closes the loop",
+        frozenset({"intersection"}),
     ),
     "map_tracking": Method("mineloc", _mineloc, "every keyframe registered to a prior map", tracks="map"),
     "intersections_map": Method(

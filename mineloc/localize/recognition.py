@@ -2,44 +2,43 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from mineloc import se3
 from mineloc.config import Config
-from mineloc.data import F32, F64, Fix, Intersection, IntersectionDatabase, Keyframe, MapCloud, WallContour
-from mineloc.localize.keyframe_clouds import levelled
+from mineloc.data import F64, I64, Fix, Intersection, IntersectionDatabase, Keyframe, MapCloud
+from mineloc.localize.junction_watch import JunctionWatch, Look
+from mineloc.localize.pose_filter import PoseFilter
 from mineloc.localize.prior_map import MapRegistration, PriorMap
-from mineloc.places.branches import Junction, find_junctions
 from mineloc.places.contour_matrix import contour_matrix, matrix_likeness
-from mineloc.places.free_grid import FreeGrid, free_grid
-from mineloc.places.wall_contour import branches_fit, likeness_peaks, wall_contour
+from mineloc.places.contour_search import ContourIndex, ContourMatch
+from mineloc.places.wall_contour import likeness_near
 
-IsPossible = Callable[[F64], bool]
-"""Whether the drone may be at a pose (4, 4) `T_map_lidar`: what is known of its position decides."""
-
-
-_FLOOR_M = 2.5
-"""Points so near an invariant point tell where the floor is there."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Seen:
-    """One keyframe of the window: its levelled points, and where its level frame is in odometry."""
-
-    cloud_level: F32
-    T_odom_level: F64
+_TURN_RAD = np.radians(10.0)
+"""The heading of a drone whose pose is known is known so well."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Candidate:
+    """An intersection that may be the one that is seen, and where the level frame would be then."""
+
     known: Intersection
     similarity: float
     T_map_level: F64
     yaw_rad: float
+    matrix: float = 0.0
+
+
+@dataclass(slots=True, eq=False)
+class _At:
+    """What one keyframe brought so far: for whoever judges it, and for the fix that comes of it."""
+
+    keyframe: Keyframe
+    known: PoseFilter | None
+    scores: dict[str, float] = field(default_factory=dict[str, float])
 
 
 class Recognizer:
@@ -52,127 +51,185 @@ class Recognizer:
 
     def __init__(self, config: Config, database: IntersectionDatabase) -> None:
         self._all, self._config, self._database = config, config.intersections, database
-        self._window: deque[_Seen] = deque(maxlen=config.intersections.window_keyframes)
+        self._watch = JunctionWatch(config.intersections)
+        self._index = ContourIndex([one.contour for one in database.intersections], config.intersections)
+        self._points = np.array([one.point_map for one in database.intersections]).reshape(-1, 3)
         self._same_id, self._same = -1, 0
         self._maps: dict[int, PriorMap] = {}
 
-    def follow(self, keyframe: Keyframe, is_possible: IsPossible) -> Fix:
-        """Take the next keyframe; the fix tells what was recognised, or at which step recognition stopped.
+    def follow(self, keyframe: Keyframe, known: PoseFilter) -> Fix:
+        """Take the next keyframe of a flight whose pose is known; the fix tells what was recognised, or why nothing.
 
         Args:
             keyframe: with points; odometry levels it.
-            is_possible: from what is known of the position.
+            known: where it is, as far as that is known.
         """
-        scores: dict[str, float] = {}
-        here = self._prepared(keyframe)  # step 1
-        junction, grid = self._junction(here)  # step 2
-        if junction is None:
-            return self._refused(keyframe, "no intersection within reach (step 2)", scores)
-        scores["branches"] = float(len(junction.branches))
-        contour = wall_contour(grid, junction.point_m, junction.branches_rad, self._config)  # step 3
-        candidates = self._candidates(contour, junction, here, keyframe, is_possible, scores)  # step 4
+        return self._recognised(_At(keyframe, known))[0]
+
+    def follow_lost(self, keyframe: Keyframe) -> list[Fix]:
+        """Take the next keyframe of a flight that may be anywhere: every intersection that it may see, verified.
+
+        One fix is refused when none is accepted. More than one accepted: they look alike, and only the way from one
+        intersection to the next can tell.
+
+        Args:
+            keyframe: with points; odometry levels it.
+        """
+        return self._recognised(_At(keyframe, None))
+
+    def _recognised(self, at: _At) -> list[Fix]:
+        """The nine steps."""
+        look = self._watch.look(at.keyframe)  # steps 1 and 2
+        if look is None:
+            return [self._stop(at, "no intersection within reach (step 2)")]
+        candidates, reason = self._candidates(look, at)  # steps 3 and 4
+        if candidates and (len(candidates) > 1 or at.known is None):  # step 5
+            candidates, reason = self._told_apart(candidates, look, at)  # step 6
         if not candidates:
-            needed = self._database.contour_threshold
-            reason = f"similarity {scores['similarity']:.2f}, at least {needed:.2f} needed (step 4)"
-            return self._refused(keyframe, reason, scores)
-        best = candidates[0] if len(candidates) == 1 else self._told_apart(candidates, junction, here, scores)  # 5, 6
-        if best is None:
-            return self._refused(keyframe, f"{len(candidates)} candidates are too much alike (step 6)", scores)
-        self._same = self._same + 1 if best.known.id == self._same_id else 1  # step 7
-        self._same_id = best.known.id
-        scores["same"] = float(self._same)
-        if self._same < self._config.same_needed:  # step 8
-            reason = f"{self._same} keyframes agree, at least {self._config.same_needed} needed (step 8)"
-            return self._refused(keyframe, reason, scores, target=best.known)
+            return [self._stop(at, reason)]
+        best = candidates[0].known
+        self._same = self._same + 1 if best.id == self._same_id else 1  # step 7
+        self._same_id = best.id
+        at.scores["same"] = float(self._same)
+        needed = self._config.same_needed if at.known is None else self._config.same_needed_known
+        if self._same < needed:  # step 8
+            reason = f"{self._same} keyframes agree, at least {needed} needed (step 8)"
+            return [_refused(at, reason, target=best.name)]
         self._same = 0
-        return self._verified(best, keyframe, here, scores)  # step 9
+        return self._all_verified(candidates, look, at)  # step 9
 
-    def _prepared(self, keyframe: Keyframe) -> _Seen:
-        level = levelled(keyframe.T_odom_lidar)
-        cloud = se3.apply(level, keyframe.points_lidar).astype(np.float32)
-        seen = _Seen(cloud, se3.rigid(keyframe.T_odom_lidar @ se3.inverse(level)))
-        self._window.append(seen)
-        return seen
+    def _candidates(self, look: Look, at: _At) -> tuple[list[_Candidate], str]:
+        """Intersections whose contour is like this one and that may be here, the most alike first; or why none."""
+        at.scores |= {"branches": float(len(look.junction.branches)), "walls": float(look.contour.walls)}
+        threshold = self._database.contour_threshold
+        if at.known is None:
+            found = self._index.matches(look.contour)
+        else:
+            threshold = min(threshold, self._config.threshold_known)
+            found = self._index.matches(look.contour, self._near(look, at.known))
+        at.scores["similarity"] = found[0].similarity if found else 0.0
+        alike = [self._placed(one, look) for one in found if one.similarity >= threshold]
+        here = alike
+        if at.known is not None:
+            here = [one for one in alike if self._may_be(one.T_map_level @ look.T_level_lidar, at.known)]
+            here = here or self._expected(look, at.known, threshold)
+        at.scores["candidates"] = float(len(here))
+        if here:
+            return here, ""
+        if alike:
+            return [], f"the pose rules out all {len(alike)} that look alike (step 4)"
+        if not found and at.known is not None and not len(self._near(look, at.known)):
+            return [], "no intersection of the database is where this one is seen (step 4)"
+        return [], f"similarity {at.scores['similarity']:.2f}, at least {threshold:.2f} needed (step 4)"
 
-    def _junction(self, here: _Seen) -> tuple[Junction | None, FreeGrid]:
-        back = se3.inverse(here.T_odom_level)
-        grid = free_grid(
-            [seen.cloud_level for seen in self._window],
-            np.array([back @ seen.T_odom_level for seen in self._window]),
-            self._config,
-        )
-        found = find_junctions(grid, self._config)
-        near = [one for one in found if np.linalg.norm(one.point_m) < self._config.recognise_m]
-        nearest = min(near, key=lambda one: float(np.linalg.norm(one.point_m)), default=None)
-        return nearest, grid
+    def _placed(self, match: ContourMatch, look: Look) -> _Candidate:
+        known = self._database.intersections[match.row]
+        T = se3.exp(np.array([0.0, 0.0, match.yaw_rad, 0.0, 0.0, 0.0]))
+        T[:3, 3] = known.point_map - T[:3, :3] @ look.point_level
+        return _Candidate(known, match.similarity, T, match.yaw_rad)
 
-    def _candidates(
-        self,
-        contour: WallContour,
-        junction: Junction,
-        here: _Seen,
-        keyframe: Keyframe,
-        is_possible: IsPossible,
-        scores: dict[str, float],
-    ) -> list[_Candidate]:
-        """Intersections whose contour is like this one and that may be here, the most alike first."""
-        floor_m = self._floor_under(junction, here)
-        T_level_lidar = se3.inverse(here.T_odom_level) @ keyframe.T_odom_lidar
-        within = np.radians(self._config.branch_match_deg)
+    def _expected(self, look: Look, known: PoseFilter, threshold: float) -> list[_Candidate]:
+        """Intersections that look as they should where the pose puts them, the most alike first.
+
+        The point of a junction seen in part lies elsewhere than that of the whole, and so do its branches: around the
+        point where it must be, the walls that are seen are in place.
+        """
+        T_map_level = known.T_map_lidar @ se3.inverse(look.T_level_lidar)
+        points = se3.apply(se3.inverse(T_map_level), self._points)
+        near = np.flatnonzero(np.linalg.norm(points, axis=1) < self._config.recognise_m)
+        yaw = float(np.arctan2(T_map_level[1, 0], T_map_level[0, 0]))
         found: list[_Candidate] = []
-        likest = 0.0
-        for known in self._database.intersections:
-            for similarity, yaw in likeness_peaks(known.contour, contour, self._config):
-                if not branches_fit(known.contour.branches_rad, contour.branches_rad, yaw, within_rad=within):
-                    continue
-                T = se3.exp(np.array([0.0, 0.0, yaw, 0.0, 0.0, 0.0]))
-                T[:3, 3] = known.point_map - T[:3, :3] @ np.array([*junction.point_m, floor_m])
-                if not is_possible(T @ T_level_lidar):
-                    continue
-                likest = max(likest, similarity)
-                if similarity >= self._database.contour_threshold:
-                    found.append(_Candidate(known, similarity, T, yaw))
-        scores["similarity"] = likest
-        scores["candidates"] = float(len(found))
+        for row in near.tolist():
+            one = self._database.intersections[row]
+            seen = self._watch.contour_at(points[row, :2], one.contour.branches_rad - yaw)
+            match = likeness_near(one.contour, seen, yaw, within_rad=_TURN_RAD, config=self._config)
+            if match.similarity >= threshold:
+                found.append(_Candidate(one, match.similarity, T_map_level, match.yaw_rad))
         return sorted(found, key=lambda one: -one.similarity)
 
-    def _told_apart(
-        self, candidates: list[_Candidate], junction: Junction, here: _Seen, scores: dict[str, float]
-    ) -> _Candidate | None:
-        """The candidate whose matrix fits best; None when another intersection fits nearly as well."""
-        points = self._stacked(here)
-        matrix = contour_matrix(points, junction.point_m, self._floor_under(junction, here), self._config)
-        ranked = sorted(
-            ((matrix_likeness(one.known.matrix, matrix, one.yaw_rad, self._config), one) for one in candidates),
-            key=lambda pair: -pair[0],
-        )
-        best = ranked[0]
-        others = [likeness for likeness, one in ranked if one.known.id != best[1].known.id]
-        scores["matrix"] = best[0]
-        scores["matrix_second"] = others[0] if others else 0.0
-        return best[1] if not others or best[0] - others[0] >= self._config.matrix_margin else None
+    def _near(self, look: Look, known: PoseFilter) -> I64:
+        """Indices of the intersections that may lie where the junction is seen."""
+        c = self._all.prior_map
+        seen = se3.apply(known.T_map_lidar, look.point_lidar[None])[0]
+        turn, shift = known.covariance[:3, :3], known.covariance[3:, 3:]
+        arm = float(np.linalg.norm(look.point_lidar))
+        sigma = np.sqrt(np.trace(shift) + np.trace(turn) * arm**2 + c.seen_floor_m**2)
+        away = np.linalg.norm(self._points - seen, axis=1)
+        return np.flatnonzero(away < c.max_moved_sigmas * sigma)
 
-    def _verified(self, best: _Candidate, keyframe: Keyframe, here: _Seen, scores: dict[str, float]) -> Fix:
+    def _may_be(self, T_map_lidar: F64, known: PoseFilter) -> bool:
+        """Before registration: an invariant point is known to some decimetres, its turn to some degrees."""
+        c = self._all.prior_map
+        away = known.sigmas_away(T_map_lidar, floor_m=c.seen_floor_m, floor_deg=c.seen_floor_deg)
+        return away <= c.max_moved_sigmas
+
+    def _told_apart(self, candidates: list[_Candidate], look: Look, at: _At) -> tuple[list[_Candidate], str]:
+        """The candidates by how their matrices fit; of a flight whose pose is known one alone, or why none."""
+        matrix = contour_matrix(self._watch.stacked(), look.junction.point_m, look.floor_m, self._config)
+        ranked = sorted(
+            (
+                _Candidate(
+                    one.known, one.similarity, one.T_map_level, one.yaw_rad,
+                    matrix_likeness(one.known.matrix, matrix, one.yaw_rad, self._config),
+                )
+                for one in candidates[: self._config.max_candidates]
+            ),
+            key=lambda one: -one.matrix,
+        )  # fmt: skip
+        best = ranked[0]
+        second = max((one.matrix for one in ranked if one.known.id != best.known.id), default=0.0)
+        at.scores |= {"matrix": best.matrix, "matrix_second": second}
+        if at.known is None:
+            return ranked, ""
+        if second and best.matrix - second < self._config.matrix_margin:
+            return [], f"{len(candidates)} candidates are too much alike (step 6)"
+        return [best], ""
+
+    def _all_verified(self, candidates: Sequence[_Candidate], look: Look, at: _At) -> list[Fix]:
+        fixes = [self._verified(one, look, at) for one in candidates]
+        trusted = [fix for fix in fixes if fix.trusted]
+        if not trusted:
+            return fixes[:1]
+        # two turns of one intersection may end at the same pose
+        kept: list[Fix] = []
+        for fix in sorted(trusted, key=lambda one: -one.scores["inlier_ratio"]):
+            if all(_apart_m(fix, other) > self._config.apart_m for other in kept):
+                kept.append(fix)
+        return kept
+
+    def _verified(self, best: _Candidate, look: Look, at: _At) -> Fix:
         """Register all keyframes of the window to the stored cloud."""
-        T_lidar_level = se3.inverse(keyframe.T_odom_lidar) @ here.T_odom_level
-        points = self._stacked(here)
-        at = se3.apply(best.T_map_level, points)
-        near = np.linalg.norm(at[:, :2] - best.known.point_map[:2], axis=1) < self._config.verify_radius_m
+        c = self._config
+        T_lidar_level = se3.inverse(look.T_level_lidar)
+        points = self._watch.stacked()
+        around = se3.apply(best.T_map_level, points)[:, :2] - best.known.point_map[:2]
+        near = np.linalg.norm(around, axis=1) < c.verify_radius_m
         points_lidar = se3.apply(T_lidar_level, points[near]).astype(np.float32)
-        expected = best.T_map_level @ se3.inverse(T_lidar_level)
+        expected = best.T_map_level @ look.T_level_lidar
         turn, shift = np.radians(3.0), 0.5
         found = self._map_of(best.known).register(points_lidar, expected, np.diag([turn**2] * 3 + [shift**2] * 3))
-        scores |= {"inlier_ratio": found.inlier_ratio, "residual_m": found.residual_m, "moved_m": found.moved_m}
         reason = self._doubt(found)
+        # a partly seen intersection says less (METHOD D4)
+        completeness = best.known.contour.walls / max(look.contour.walls, 1)
+        noise = float(np.clip(completeness, 1.0, c.completeness_limit))
         return Fix(
-            stamp_ns=keyframe.stamp_ns,
-            keyframe=keyframe.index,
+            stamp_ns=at.keyframe.stamp_ns,
+            keyframe=at.keyframe.index,
             T_map_lidar=found.T_map_lidar,
-            covariance=found.covariance,
+            covariance=noise * found.covariance,
             trusted=not reason,
             reason=reason,
             target=best.known.name,
-            scores=scores,
+            point_map=best.known.point_map,
+            scores={
+                **at.scores,
+                "id": float(best.known.id),
+                "matched_similarity": best.similarity,
+                "completeness": 1.0 / max(completeness, 1e-9),
+                "inlier_ratio": found.inlier_ratio,
+                "residual_m": found.residual_m,
+                "moved_m": found.moved_m,
+            },
         )
 
     def _doubt(self, found: MapRegistration) -> str:
@@ -183,40 +240,41 @@ class Recognizer:
             return f"residual {found.residual_m:.3f} m, at most {c.verify_residual_m} m allowed (step 9)"
         return ""
 
-    def _stacked(self, here: _Seen) -> F64:
-        """(n, 3) points of the window in the level frame of the newest keyframe (paper A, eq. 20)."""
-        back = se3.inverse(here.T_odom_level)
-        return np.concatenate([se3.apply(back @ seen.T_odom_level, seen.cloud_level) for seen in self._window])
-
-    def _floor_under(self, junction: Junction, here: _Seen) -> float:
-        """Height of the floor at the invariant point, in the level frame."""
-        points = self._stacked(here)
-        near = np.linalg.norm(points[:, :2] - junction.point_m, axis=1) < _FLOOR_M
-        return float(np.percentile(points[near, 2], 5.0)) if near.any() else float(np.percentile(points[:, 2], 5.0))
-
     def _map_of(self, known: Intersection) -> PriorMap:
         if known.id not in self._maps:
-            n = len(known.points_m)
-            one = np.ones(n, np.int32)
-            cloud = MapCloud(
-                origin_m=known.point_map,
-                points_m=known.points_m,
-                normals=known.normals,
-                counts=one,
-                visits=one,
-                thickness_m=np.zeros(n, np.float32),
-                near_m=np.zeros(n, np.float32),
-                surface=np.zeros(n, np.uint8),
-                voxel_m=0.1,
-            )
-            self._maps[known.id] = PriorMap(cloud, self._all.prior_map, self._all.odometry)
+            self._maps[known.id] = PriorMap(_cloud_of(known), self._all.prior_map, self._all.odometry)
         return self._maps[known.id]
 
-    def _refused(
-        self, keyframe: Keyframe, reason: str, scores: dict[str, float], *, target: Intersection | None = None
-    ) -> Fix:
-        if target is None:
-            self._same_id, self._same = -1, 0
-        name = "" if target is None else target.name
-        stamp_ns, index = keyframe.stamp_ns, keyframe.index
-        return Fix(stamp_ns, index, None, None, trusted=False, reason=reason, target=name, scores=scores)
+    def _stop(self, at: _At, reason: str) -> Fix:
+        """Refused before an intersection had a name: those before it no longer count."""
+        self._same_id, self._same = -1, 0
+        return _refused(at, reason)
+
+
+def _refused(at: _At, reason: str, *, target: str = "") -> Fix:
+    stamp_ns, index = at.keyframe.stamp_ns, at.keyframe.index
+    return Fix(stamp_ns, index, None, None, trusted=False, reason=reason, target=target, scores=dict(at.scores))
+
+
+def _apart_m(one: Fix, other: Fix) -> float:
+    assert one.T_map_lidar is not None
+    assert other.T_map_lidar is not None
+    turn = float(se3.angle_rad(se3.inverse(one.T_map_lidar) @ other.T_map_lidar))
+    return float(np.linalg.norm(one.T_map_lidar[:3, 3] - other.T_map_lidar[:3, 3])) + 3.0 * turn
+
+
+def _cloud_of(known: Intersection) -> MapCloud:
+    """The stored cloud as a map of its own."""
+    n = len(known.points_m)
+    one = np.ones(n, np.int32)
+    return MapCloud(
+        origin_m=known.point_map,
+        points_m=known.points_m,
+        normals=known.normals,
+        counts=one,
+        visits=one,
+        thickness_m=np.zeros(n, np.float32),
+        near_m=np.zeros(n, np.float32),
+        surface=np.zeros(n, np.uint8),
+        voxel_m=0.1,
+    )

@@ -116,9 +116,7 @@ def _widest(grid: FreeGrid, seen: Clearance) -> list[tuple[F64, float]]:
     return kept
 
 
-def _junction_at(
-    grid: FreeGrid, free: Bool, place: F64, room: float, config: IntersectionsConfig
-) -> Junction | None:
+def _junction_at(grid: FreeGrid, free: Bool, place: F64, room: float, config: IntersectionsConfig) -> Junction | None:
     branches = branches_around(grid, free, place, room, config)
     if len(branches) < _LEAST:
         return None

@@ -103,13 +103,7 @@ def _open_by_cross(is_open: Bool, out: Bool) -> None:
     rows, columns = is_open.shape
     for r in range(1, rows - 1):
         for c in range(1, columns - 1):
-            if (
-                is_open[r, c]
-                and is_open[r - 1, c]
-                and is_open[r + 1, c]
-                and is_open[r, c - 1]
-                and is_open[r, c + 1]
-            ):
+            if is_open[r, c] and is_open[r - 1, c] and is_open[r + 1, c] and is_open[r, c - 1] and is_open[r, c + 1]:
                 out[r, c] = out[r - 1, c] = out[r + 1, c] = out[r, c - 1] = out[r, c + 1] = True
 
 
@@ -136,6 +130,16 @@ def flood(free: Bool, row: int, column: int, out: Bool) -> None:
 @njit(cache=True, nogil=True)
 def _squared_distance(free: Bool) -> I64:
     """(rows, columns) squared distance to the nearest cell that is not free (Felzenszwalb and Huttenlocher 2012)."""
+    down = _down_columns(free)
+    out = np.empty_like(down)
+    for r in range(len(down)):
+        _along_row(down[r], out[r])
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _down_columns(free: Bool) -> I64:
+    """(rows, columns) distance to the nearest closed cell of the column."""
     rows, columns = free.shape
     down = np.empty((rows, columns), np.int64)
     for c in range(columns):
@@ -149,32 +153,35 @@ def _squared_distance(free: Bool) -> I64:
             if not free[r, c]:
                 last = r
             down[r, c] = min(down[r, c], last - r)
-    out = np.empty((rows, columns), np.int64)
+    return down
+
+
+@njit(cache=True, nogil=True)
+def _along_row(down: I64, out: I64) -> None:
+    """The lower envelope of the parabolas over one row."""
+    columns = len(down)
     at = np.empty(columns, np.int64)
     until = np.empty(columns + 1)
-    for r in range(rows):
-        k = -1
-        for q in range(columns):
-            if down[r, q] >= _FAR // 2:
-                continue
-            f = down[r, q] ** 2 + q * q
-            crossing = -np.inf
-            while k >= 0:
-                v = at[k]
-                crossing = (f - (down[r, v] ** 2 + v * v)) / (2.0 * (q - v))
-                if crossing > until[k]:
-                    break
-                k -= 1
-                crossing = -np.inf
-            k += 1
-            at[k], until[k], until[k + 1] = q, crossing, np.inf
-        if k < 0:
-            out[r, :] = _FAR
+    k = -1
+    for q in range(columns):
+        if down[q] >= _FAR // 2:
             continue
-        k = 0
-        for q in range(columns):
-            while until[k + 1] < q:
-                k += 1
+        f = down[q] ** 2 + q * q
+        crossing = -np.inf
+        while k >= 0:
             v = at[k]
-            out[r, q] = (q - v) ** 2 + down[r, v] ** 2
-    return out
+            crossing = (f - (down[v] ** 2 + v * v)) / (2.0 * (q - v))
+            if crossing > until[k]:
+                break
+            k -= 1
+            crossing = -np.inf
+        k += 1
+        at[k], until[k], until[k + 1] = q, crossing, np.inf
+    if k < 0:
+        out[:] = _FAR
+        return
+    k = 0
+    for q in range(columns):
+        while until[k + 1] < q:
+            k += 1
+        out[q] = (q - at[k]) ** 2 + down[at[k]] ** 2

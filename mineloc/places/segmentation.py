@@ -58,41 +58,59 @@ def intersections_of(
         roadways: its centre-lines, on the floor.
         config: of detection and descriptors.
     """
-    segments = _segments(_Floor.of(sheet), roadways, config)
-    is_node = [_is_node(segment.point_map, roadways) for segment in segments]
-    order = sorted(range(len(segments)), key=lambda k: (not is_node[k], k))
-    segments = [segments[k] for k in order]
-    neighbours = neighbours_along([segment.point_map for segment in segments], roadways)
+    seen = _told_once(_segments(_Floor.of(sheet), roadways, config), config)
+    is_node = [_is_node(one.segment.point_map, roadways) for one in seen]
+    order = sorted(range(len(seen)), key=lambda k: (not is_node[k], k))
+    seen = [seen[k] for k in order]
+    neighbours = neighbours_along([one.segment.point_map for one in seen], roadways)
     points = cloud.points_map
     tree = KDTree(points[:, :2])
+    found: list[Intersection] = []
+    for id, (one, at_node) in enumerate(zip(seen, sorted(is_node, reverse=True), strict=True)):
+        point = one.segment.point_map
+        near = np.array(sorted(tree.query_ball_point(point[:2], config.cloud_radius_m)), dtype=np.int64)
+        level = np.abs(points[near, 2] - point[2]) < config.cloud_height_m
+        found.append(_described(id, one, cloud, near[level], neighbours[id], config, is_bay=not at_node))
+    return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Described:
+    """A segment with its contour and how well that is recognised."""
+
+    segment: Segment
+    contour: WallContour
+    quality: float
+
+
+def _told_once(segments: Sequence[Segment], config: IntersectionsConfig) -> list[_Described]:
+    """Of junctions nearer to each other than `merge_m`, which are one place, the one that is recognised best."""
     contours = [
         wall_contour(segment.grid, segment.junction.point_m, segment.junction.branches_rad, config)
         for segment in segments
     ]
-    found: list[Intersection] = []
-    for id, (segment, at_node) in enumerate(zip(segments, sorted(is_node, reverse=True), strict=True)):
-        near = np.array(sorted(tree.query_ball_point(segment.point_map[:2], config.cloud_radius_m)), dtype=np.int64)
-        level = np.abs(points[near, 2] - segment.point_map[2]) < config.cloud_height_m
-        near = near[level]
-        quality = self_recognition(segment.grid, segment.junction.point_m, id, contours, config)
-        found.append(
-            _described(id, segment, contours[id], cloud, near, neighbours[id], quality, config, is_bay=not at_node)
-        )
-    return found
+    qualities = [
+        self_recognition(segment.grid, segment.junction.point_m, k, contours, config)
+        for k, segment in enumerate(segments)
+    ]
+    kept: list[int] = []
+    for k in sorted(range(len(segments)), key=lambda k: (-qualities[k], k)):
+        if _is_apart(segments[k], [segments[other] for other in kept], config.merge_m):
+            kept.append(k)
+    return [_Described(segments[k], contours[k], qualities[k]) for k in sorted(kept)]
 
 
 def _described(
     id: int,
-    segment: Segment,
-    contour: WallContour,
+    seen: _Described,
     cloud: MapCloud,
     near: I64,
     neighbours: tuple[tuple[int, float], ...],
-    quality: float,
     config: IntersectionsConfig,
     *,
     is_bay: bool,
 ) -> Intersection:
+    segment, contour = seen.segment, seen.contour
     point = segment.point_map
     around = (cloud.points_map[near] - point).astype(np.float32)
     covariance = np.zeros((3, 3))
@@ -110,7 +128,7 @@ def _described(
         points_m=around,
         normals=cloud.normals[near],
         neighbours=neighbours,
-        quality=quality,
+        quality=seen.quality,
     )
 
 

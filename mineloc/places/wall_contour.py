@@ -8,7 +8,7 @@ import numpy as np
 
 from mineloc.compiled import njit
 from mineloc.config import IntersectionsConfig
-from mineloc.data import F32, F64, U8, Sight, WallContour
+from mineloc.data import F32, F64, U8, Bool, Sight, WallContour
 from mineloc.places.free_grid import FreeGrid
 
 _STEP_M = 0.1
@@ -63,16 +63,34 @@ def contour_likeness(a: WallContour, b: WallContour, config: IntersectionsConfig
     return _at(curve, int(curve.argmax()))
 
 
-def likeness_peaks(a: WallContour, b: WallContour, config: IntersectionsConfig) -> list[Likeness]:
-    """The best turn and others nearly as good, the best first: an X looks the same from four sides.
+def likeness_near(
+    a: WallContour, b: WallContour, yaw_rad: float, *, within_rad: float, config: IntersectionsConfig
+) -> Likeness:
+    """The best turn of b near a given one.
 
     Raises:
         ValueError: as `likeness_curve`.
     """
     curve = likeness_curve(a, b, config)
-    is_peak = (curve >= np.roll(curve, 1)) & (curve > np.roll(curve, -1)) & (curve >= curve.max() - config.peak_drop)
-    ranked = np.flatnonzero(is_peak & (curve > 0))
+    turns = 2 * np.pi * np.arange(len(curve)) / len(curve)
+    away = np.abs((turns - yaw_rad + np.pi) % (2 * np.pi) - np.pi)
+    return _at(curve, int(np.where(away <= within_rad, curve, -1.0).argmax()))
+
+
+def peaks_of(curve: F64, may_be: Bool, config: IntersectionsConfig) -> list[Likeness]:
+    """The best turn and others nearly as good, the best first: an X looks the same from four sides.
+
+    Args:
+        curve: (n,) similarity by turn.
+        may_be: (n,) turns that are asked for.
+        config: `peak_drop`.
+    """
+    is_peak = (curve >= np.roll(curve, 1)) & (curve > np.roll(curve, -1)) & may_be & (curve > 0)
+    ranked = np.flatnonzero(is_peak)
+    if not len(ranked):
+        return []
     ranked = ranked[np.argsort(-curve[ranked], kind="stable")]
+    ranked = ranked[curve[ranked] >= curve[ranked[0]] - config.peak_drop]
     kept: list[int] = []
     for k in ranked.tolist():
         if all(min(abs(k - other), len(curve) - abs(k - other)) > _PEAK_BINS for other in kept):
@@ -98,18 +116,24 @@ def likeness_curve(a: WallContour, b: WallContour, config: IntersectionsConfig) 
     """
     if len(a.distance) != len(b.distance) or a.radius_m != b.radius_m:
         raise ValueError("contours of other sizes")
-    scale = (a.radius_m / config.contour_sigma_m) ** 2
-    return _curve(a.distance, a.sight, b.distance, b.sight, scale, config.contour_known)
+    kernel = kernel_table(a.radius_m, config)
+    everywhere = np.ones(len(a.distance), np.bool_)
+    return curve_where(a.distance, a.sight, b.distance, b.sight, everywhere, kernel, config.contour_known)
+
+
+def kernel_table(radius_m: float, config: IntersectionsConfig) -> F64:
+    """(1024,) likeness of two walls by the difference of their distances over the radius, from 0 to 1."""
+    return np.exp(-np.square(radius_m / config.contour_sigma_m * np.linspace(0.0, 1.0, 1024)))
 
 
 @njit(cache=True, nogil=True)
-def _curve(a: F32, sight_a: U8, b: F32, sight_b: U8, scale: float, least: float) -> F64:
+def curve_where(a: F32, sight_a: U8, b: F32, sight_b: U8, wanted: Bool, kernel: F64, least: float) -> F64:
+    """(n,) the likeness curve at the turns that are wanted, else 0; `kernel` as `kernel_table` has it."""
     n = len(a)
-    kernel = np.empty(1024)
-    for i in range(1024):
-        kernel[i] = np.exp(-scale * (i / 1023.0) ** 2)
     out = np.zeros(n)
     for k in range(n):
+        if not wanted[k]:
+            continue
         known, total = 0, 0.0
         for i in range(n):
             j = i + k

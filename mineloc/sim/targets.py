@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mineloc import se3
+from mineloc.config import SimulateConfig
 from mineloc.data import ControlPoint, Observation
 from mineloc.sim.flight import START_NS, SimulatedFlight
 from mineloc.sim.scene import Scene
@@ -75,9 +76,20 @@ class TargetSurvey:
     observations: tuple[Observation, ...]
     T_grid_map: F64
 
-    def grid_json(self) -> bytes:
-        """The truth of the grid as a file: {"T_grid_map": (4, 4)}."""
-        return json.dumps({"T_grid_map": self.T_grid_map.tolist()}).encode()
+
+def grid_of(config: SimulateConfig) -> F64:
+    """(4, 4) `T_grid_map` of a flight's mine."""
+    T_grid_map = se3.exp(np.array([0.0, 0.0, np.deg2rad(config.grid_yaw_deg), 0.0, 0.0, 0.0]))
+    T_grid_map[:3, 3] = (config.grid_e_m, config.grid_n_m, config.grid_z_m)
+    return T_grid_map
+
+
+def grid_json(config: SimulateConfig) -> bytes | None:
+    """The truth of the grid as a file: {"T_grid_map": (4, 4)}; None where no target and no option speaks of one."""
+    T_grid_map = grid_of(config)
+    if not config.target_every_m and np.array_equal(T_grid_map, np.eye(4)):
+        return None
+    return json.dumps({"T_grid_map": T_grid_map.tolist()}).encode()
 
 
 def survey_of(flight: SimulatedFlight) -> TargetSurvey | None:
@@ -85,8 +97,7 @@ def survey_of(flight: SimulatedFlight) -> TargetSurvey | None:
     config = flight.config
     if not config.target_every_m:
         return None
-    T_grid_map = se3.exp(np.array([0.0, 0.0, np.deg2rad(config.grid_yaw_deg), 0.0, 0.0, 0.0]))
-    T_grid_map[:3, 3] = (config.grid_e_m, config.grid_n_m, config.grid_z_m)
+    T_grid_map = grid_of(config)
     targets = lay_targets(flight)
     points = _surveyed(targets, T_grid_map, flight)
     return TargetSurvey(targets, points, tuple(_picked(targets, flight)), T_grid_map)

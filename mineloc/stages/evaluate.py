@@ -12,6 +12,7 @@ from mineloc.errors import EvaluationError
 from mineloc.io.trajectories import LoadedTrajectory, load_trajectory
 from mineloc.metrics.alignment import Alignment
 from mineloc.metrics.association import Pairs
+from mineloc.stages.recognitions import Recognition, recognition_of
 from mineloc.stages.run_folder import RunFolder
 from mineloc.stages.scores import Scores, pair, score
 
@@ -28,6 +29,7 @@ class Evaluation:
         scores: one entry a trajectory; a run has `smoothed` and `online`.
         trusted_share: share of the run's sweeps whose pose rests on more than the motion prior; None for a file.
         notes: what was left out while reading.
+        recognition: of a run that was given a database of intersections and a reference in its map.
     """
 
     estimate: str
@@ -35,6 +37,7 @@ class Evaluation:
     scores: tuple[Scores, ...]
     trusted_share: float | None = None
     notes: tuple[str, ...] = ()
+    recognition: Recognition | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON, without the arrays along the flight."""
@@ -45,6 +48,7 @@ class Evaluation:
             "trusted_share": self.trusted_share,
             "notes": list(self.notes),
             "trajectories": [one.to_dict() for one in self.scores],
+            "recognition": None if self.recognition is None else self.recognition.to_dict(),
         }
 
 
@@ -87,6 +91,7 @@ def evaluate(
         scores=tuple(scores),
         trusted_share=given.trusted_share,
         notes=(*given.notes, *_remarks(truth)),
+        recognition=None if given.run is None else recognition_of(given.run, truth.trajectory),
     )
 
 
@@ -99,6 +104,7 @@ class _Estimates:
     trusted_share: float | None = None
     notes: tuple[str, ...] = ()
     positions_only: bool = False
+    run: RunFolder | None = None
 
 
 def _estimates(estimate: str | Path) -> _Estimates:
@@ -112,7 +118,7 @@ def _estimates(estimate: str | Path) -> _Estimates:
         own = LoadedTrajectory(run.reference, str(folder / "reference.tum"), "tum")
     trusted = run.sweeps["trusted"].to_numpy()
     share = float(trusted.mean()) if len(trusted) else None
-    return _Estimates({"smoothed": run.smoothed, "online": run.online}, own, share)
+    return _Estimates({"smoothed": run.smoothed, "online": run.online}, own, share, run=run)
 
 
 def _alignments(estimate: str | Path, align: Alignment | None, *, positions_only: bool) -> tuple[Alignment, ...]:

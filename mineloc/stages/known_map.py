@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import polars as pl
 
 from mineloc.config import Config
 from mineloc.data import F64, IntersectionDatabase, Trajectory
@@ -20,6 +21,7 @@ from mineloc.localize.map_tracking import Prior, Start
 from mineloc.localize.prior_map import PriorMap
 from mineloc.sim.targets import GRID_FILE
 from mineloc.stages.map_folder import MapFolder
+from mineloc.stages.run_tables import intersections_table
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +46,7 @@ class KnownMap:
 
         Raises:
             FormatError: not a map folder or no database, or damaged.
-            ConfigError: they are of two maps, or nothing says where the flight begins.
+            ConfigError: they are of two maps.
         """
         survey = None if prior_map is None else MapFolder.open(prior_map)
         known = None if database is None else read_database(database)
@@ -76,6 +78,12 @@ class KnownMap:
         return reference.compose(left=T_grid_map)
 
     @property
+    def intersections(self) -> pl.DataFrame | None:
+        """For a run folder; None without a database."""
+        database = self.prior.database
+        return None if database is None else intersections_table(database.intersections)
+
+    @property
     def facts(self) -> Mapping[str, Any]:
         """For the manifest of a run."""
         return {
@@ -88,13 +96,7 @@ class KnownMap:
 def _prior(
     survey: MapFolder | None, database: IntersectionDatabase | None, config: Config, grid_origin_m: F64
 ) -> Prior:
+    """Without a start the database finds the flight; a method with neither says what it needs."""
     start = Start.of(config.prior_map, grid_origin_m)
-    if start is None:
-        raise ConfigError(
-            "prior_map.start_m",
-            "is not set",
-            expected="where the drone begins, in the frame of the map",
-            todo="set it, and prior_map.start_yaw_deg",
-        )
     patches = None if survey is None else PriorMap(survey.cloud(), config.prior_map, config.odometry)
     return Prior(start, patches, database)

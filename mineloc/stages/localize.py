@@ -51,6 +51,7 @@ class LocalizeResult:
         fixes, fixes_refused: keyframes that the map or a place seen before holds, and those that were refused.
         path_m: length of the smoothed trajectory.
         sweeps_per_s, real_time_factor: of the whole run, reading included.
+        in_map: False where the flight never found itself in the map: its poses are in a frame of its own.
     """
 
     out: Path
@@ -63,16 +64,19 @@ class LocalizeResult:
     path_m: float
     sweeps_per_s: float
     real_time_factor: float
+    in_map: bool
 
     def to_dict(self) -> dict[str, Any]:
         """For `--json`."""
         return {**asdict(self), "out": str(self.out)}
 
     def summary(self) -> str:
-        """Two lines for people, three where something was recognised or refused."""
+        """Two lines for people, more where something was recognised or refused."""
         doubt = f"{self.untrusted} sweeps rest on the motion prior alone, {self.degenerate} are weak in a direction"
         tried = self.fixes + self.fixes_refused
         found = f"{self.fixes} of {tried} fixes accepted\n" if tried else ""
+        if not self.in_map:
+            found += "NOT FOUND in the map: the poses are in a frame of their own, from the start of the flight\n"
         return (
             f"{self.out}: {self.sweeps} sweeps, {self.keyframes} keyframes, {self.path_m:.1f} m; {doubt}\n"
             f"{found}"
@@ -130,15 +134,16 @@ def localize(
             folder,
             smoothed=smoothed,
             online=found.online.compose(right=T_lidar_body, child="body"),
-            reference=reader.reference() if known is None else known.reference_of(reader),
+            reference=reader.reference() if known is None or not found.in_map else known.reference_of(reader),
             sweeps=_sweeps(found),
             keyframes=_keyframes(found),
             points=_points(found),
             fixes=fixes_table(found.fixes),
+            intersections=None if known is None else known.intersections,
             timing=timing,
             manifest={
                 **_manifest(flight, reader, method, chosen, config, counts),
-                "map": None if known is None else known.facts,
+                "map": None if known is None else {**known.facts, "found": found.in_map},
             },
         )
     return LocalizeResult(
@@ -152,6 +157,7 @@ def localize(
         path_m=float(smoothed.path_m[-1]),
         sweeps_per_s=timing["sweeps_per_s"],
         real_time_factor=timing["real_time_factor"],
+        in_map=found.in_map,
     )
 
 

@@ -18,7 +18,7 @@ import polars as pl
 from mineloc.data import F64, Trajectory
 from mineloc.errors import FormatError
 from mineloc.io.trajectories import read_tum, write_tum
-from mineloc.stages.run_tables import FIXES, KEYFRAMES, POINTS, SWEEPS, checked, poses_of
+from mineloc.stages.run_tables import FIXES, INTERSECTIONS, KEYFRAMES, POINTS, SWEEPS, checked, poses_of
 
 SCHEMA = "mineloc.run/1"
 
@@ -92,6 +92,20 @@ class RunFolder:
         """
         return _read_table(self.path / "points.parquet", POINTS)
 
+    def intersections(self) -> pl.DataFrame | None:
+        """Those of the database that the run was given (`INTERSECTIONS`); None without one.
+
+        Raises:
+            FormatError: as `open`.
+        """
+        path = self.path / "intersections.parquet"
+        return _read_table(path, INTERSECTIONS) if path.exists() else None
+
+    @property
+    def T_body_lidar(self) -> F64:
+        """(4, 4) of the flight's calibration."""
+        return np.array(self.manifest["calibration"]["T_body_lidar"], dtype=np.float64)
+
     @property
     def keyframe_poses(self) -> F64:
         """(k, 4, 4) smoothed `T_map_lidar` of the keyframes."""
@@ -110,6 +124,7 @@ def write_run_folder(
     fixes: pl.DataFrame,
     timing: Mapping[str, Any],
     manifest: Mapping[str, Any],
+    intersections: pl.DataFrame | None = None,
 ) -> None:
     """Write a run into an existing empty folder (the temporary of `output.new_folder`).
 
@@ -124,6 +139,8 @@ def write_run_folder(
         "points": checked(points, POINTS, "points"),
         "fixes": checked(fixes, FIXES, "fixes"),
     }
+    if intersections is not None:
+        tables["intersections"] = checked(intersections, INTERSECTIONS, "intersections")
     _check_keys(manifest, MANIFEST_KEYS, "manifest")
     _check_keys(timing, TIMING_KEYS, "timing")
     _check_together(smoothed, online, tables)

@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from mineloc import se3
-from mineloc.data import F64, Fix
+from mineloc.data import F64, Fix, Intersection
 
 _POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 _SIGMAS = ("sigma_xy_m", "sigma_z_m", "sigma_yaw_deg")
@@ -53,6 +53,16 @@ FIXES = pl.Schema(
         "scores": pl.String(),
     }
 )
+INTERSECTIONS = pl.Schema(
+    {
+        "id": pl.Int64(),
+        "name": pl.String(),
+        "kind": pl.String(),
+        "x_m": pl.Float64(),
+        "y_m": pl.Float64(),
+        "z_m": pl.Float64(),
+    }
+)
 # Columns that may not be null: without them a row says nothing.
 _ALWAYS = ("stamp_ns", "trusted", "reason", "index", "keyframe", *_POSE)
 
@@ -91,6 +101,20 @@ def fixes_table(fixes: Sequence[Fix]) -> pl.DataFrame:
                 row |= dict(zip(_SIGMAS, sigmas(fix.T_map_lidar, fix.covariance), strict=True))
         rows.append(row)
     return pl.DataFrame([{name: row.get(name) for name in FIXES} for row in rows], schema=FIXES)
+
+
+def intersections_table(intersections: Sequence[Intersection]) -> pl.DataFrame:
+    """What a run knew of the intersections of its map (`INTERSECTIONS`)."""
+    points = np.array([one.point_map for one in intersections]).reshape(-1, 3)
+    return pl.DataFrame(
+        {
+            "id": [one.id for one in intersections],
+            "name": [one.name for one in intersections],
+            "kind": [one.kind for one in intersections],
+            **dict(zip(("x_m", "y_m", "z_m"), points.T, strict=True)),
+        },
+        schema=INTERSECTIONS,
+    )
 
 
 def sigmas(T_map_lidar: F64, covariance: F64) -> tuple[float, float, float]:

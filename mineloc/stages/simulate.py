@@ -18,7 +18,7 @@ from mineloc.sim.changes import CHANGES_FILE, changed_mine, changes_json
 from mineloc.sim.flight import TRUTH_NS, Packet, SimulatedFlight
 from mineloc.sim.mine import load_mine
 from mineloc.sim.tag_camera import TagCamera
-from mineloc.sim.targets import GRID_FILE, TargetSurvey, survey_of
+from mineloc.sim.targets import GRID_FILE, TargetSurvey, grid_json, survey_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +110,8 @@ def _write(flight: SimulatedFlight, out: Path, progress: Progress) -> tuple[Coun
     with FlightWriter(out, flight.info, flight.calibration) as writer:
         if survey is not None:
             _attach(survey, writer)
+        if (grid := grid_json(flight.config)) is not None:
+            writer.add_attachment(GRID_FILE, "application/json", grid)
         if (changes := changes_json(flight.config)) is not None:
             writer.add_attachment(CHANGES_FILE, "application/json", changes)
         tags = _tag_camera(flight, survey)
@@ -148,11 +150,10 @@ def _span(packet: Packet) -> tuple[int, int]:
 
 
 def _attach(survey: TargetSurvey, writer: FlightWriter) -> None:
-    """The targets, what was picked of them, and the truth of the mine grid."""
+    """The targets, and what was picked of them."""
     writer.add_attachment(
         survey_files.TARGETS_FILE, survey_files.MEDIA_TYPE, survey_files.control_points_csv(survey.points)
     )
     writer.add_attachment(
         survey_files.OBSERVATIONS_FILE, survey_files.MEDIA_TYPE, survey_files.observations_csv(survey.observations)
     )
-    writer.add_attachment(GRID_FILE, "application/json", survey.grid_json())

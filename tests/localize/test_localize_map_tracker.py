@@ -8,9 +8,10 @@ from map_clouds import cloud_of
 from rough_mine import Drifted, WallPoints, fly_along, ring, roadway_along
 
 from mineloc import se3
-from mineloc.config import OdometryConfig, PriorMapConfig
+from mineloc.config import Config, GraphConfig, OdometryConfig, PriorMapConfig
 from mineloc.data import F64, Fix
 from mineloc.localize.map_tracker import MapTracker
+from mineloc.localize.pose_filter import PoseFilter
 from mineloc.localize.prior_map import PriorMap
 
 ORIGIN = np.array([512_000.0, 4_398_000.0, 2_300.0])
@@ -45,12 +46,12 @@ def track(flown: Drifted, prior: PriorMap, *, off: F64 | None = None) -> tuple[l
     shifted = flown.truth.copy()
     shifted[:, :3, 3] += ORIGIN
     start = shifted[0] @ se3.exp(np.zeros(6) if off is None else off)
-    tracker = MapTracker(prior, PriorMapConfig(), T_map_lidar=start, covariance=WIDE)
-    fixes, errors = [], []
+    tracker = MapTracker(prior, Config(), PoseFilter(start, WIDE, GraphConfig()))
+    errors = []
     for keyframe, edge, T in zip(flown.keyframes, flown.edges, shifted, strict=True):
-        fixes.append(tracker.follow(keyframe, edge))
+        tracker.follow(keyframe, edge)
         errors.append(np.linalg.norm((se3.inverse(T) @ tracker.filter.T_map_lidar)[:3, 3]))
-    return fixes, np.array(errors), tracker
+    return tracker.fixes, np.array(errors), tracker
 
 
 def drift_of(flown: Drifted) -> float:

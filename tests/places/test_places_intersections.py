@@ -13,8 +13,8 @@ from mineloc import se3
 from mineloc.config import IntersectionsConfig
 from mineloc.data import F64, Sight, WallContour
 from mineloc.places.branches import Branch, Junction, find_junctions, invariant_point, ring, ring_plainly
-from mineloc.places.contour_matrix import contour_matrix, matrix_likeness
 from mineloc.places.clearance import clearance_of, clearance_plainly
+from mineloc.places.contour_matrix import contour_matrix, matrix_likeness
 from mineloc.places.free_grid import FreeGrid, free_grid, free_grid_plainly, plan_view
 from mineloc.places.wall_contour import (
     branches_fit,

@@ -14,7 +14,7 @@ from mineloc.mapping.tags import observe_tags
 from mineloc.sim.flight import START_NS, SimulatedFlight
 from mineloc.sim.mine import Mine
 from mineloc.sim.tag_camera import TagCamera
-from mineloc.sim.targets import TargetSurvey, in_sight, survey_of
+from mineloc.sim.targets import TargetSurvey, grid_json, in_sight, survey_of
 
 CONFIG = SimulateConfig(
     length_m=300,
@@ -72,7 +72,8 @@ def test_survey_is_the_truth_in_the_mine_grid_but_for_its_sigma(survey: TargetSu
     assert truth[:, 1].mean() == pytest.approx(7_100_000, abs=500)
     east = survey.T_grid_map[:3, 0]
     np.testing.assert_allclose(east, [np.cos(np.pi / 6), np.sin(np.pi / 6), 0])
-    np.testing.assert_array_equal(json.loads(survey.grid_json())["T_grid_map"], survey.T_grid_map)
+    np.testing.assert_array_equal(json.loads(grid_json(CONFIG) or b"{}")["T_grid_map"], survey.T_grid_map)
+    assert grid_json(SimulateConfig()) is None
     assert [point.role for point in survey.points[:6]] == ["control", "control", "check"] * 2
     assert len({point.name for point in survey.points}) == len(survey.points)
     assert {point.tag_id for point in survey.points} == {None}
