@@ -10,6 +10,7 @@ from prefect import flow
 from prefect.futures import PrefectFuture
 from prefect.utilities.annotations import opaque
 
+from flows.database import database
 from flows.ingest import ingest, simulate
 from flows.localize import evaluate, localize, qa
 from flows.reconstruct import reconstruct
@@ -20,7 +21,9 @@ from mineloc.survey.events import Event
 from mineloc.survey.plan import plan_survey
 from mineloc.survey.spec import read_survey
 
-TASKS = {task.name: task for task in (simulate, ingest, reconstruct, localize, evaluate, record, report)}
+TASKS = {
+    task.name: task for task in (simulate, ingest, reconstruct, database, localize, evaluate, record, report)
+}
 
 
 @flow(name="survey", persist_result=False, validate_parameters=False)

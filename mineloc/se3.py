@@ -86,12 +86,12 @@ def log(T: F64) -> F64:
 
 
 def adjoint(T: F64) -> F64:
-    """(6, 6) adjoint for `[rotation, translation]`: `T @ exp(ξ) == exp(Ad(T) ξ) @ T`."""
-    r = T[:3, :3]
-    out = np.zeros((6, 6))
-    out[:3, :3] = r
-    out[3:, 3:] = r
-    out[3:, :3] = hat(T[:3, 3]) @ r
+    """(…, 6, 6) adjoint for `[rotation, translation]`: `T @ exp(ξ) == exp(Ad(T) ξ) @ T`."""
+    r = T[..., :3, :3]
+    out = np.zeros((*T.shape[:-2], 6, 6))
+    out[..., :3, :3] = r
+    out[..., 3:, 3:] = r
+    out[..., 3:, :3] = hat(T[..., :3, 3]) @ r
     return out
 
 

@@ -67,16 +67,18 @@ def pairwise_agreement(fixes: Sequence[Fix], odometry: RelativeUncertainty) -> B
         fixes: trusted, by rising keyframe.
         odometry: of all keyframes.
     """
-    n = len(fixes)
-    agree = np.eye(n, dtype=np.bool_)
     poses, covariances = _poses(fixes), _covariances(fixes)
-    for a in range(n):
-        for b in range(a + 1, n):
-            expected = odometry.between(fixes[a].keyframe, fixes[b].keyframe)
-            error = se3.log(se3.rigid(se3.inverse(expected.T_i_j) @ se3.inverse(poses[a]) @ poses[b]))
-            back = se3.adjoint(se3.inverse(expected.T_i_j))
-            spread = expected.covariance + covariances[b] + back @ covariances[a] @ back.T
-            agree[a, b] = agree[b, a] = error @ np.linalg.solve(spread, error) <= 6 * _PAIR_SIGMAS**2
+    keyframes = np.array([fix.keyframe for fix in fixes])
+    agree = np.eye(len(fixes), dtype=np.bool_)
+    for a in range(len(fixes) - 1):
+        others = slice(a + 1, None)
+        expected, spread = odometry.along(int(keyframes[a]), keyframes[others])
+        back = se3.inverse(expected)
+        error = se3.log(se3.rigid(back @ se3.inverse(poses[a]) @ poses[others]))
+        carried = se3.adjoint(back)
+        spread = spread + covariances[others] + carried @ covariances[a] @ np.swapaxes(carried, 1, 2)
+        squared = np.einsum("ni,ni->n", error, np.linalg.solve(spread, error[:, :, None])[:, :, 0])
+        agree[a, others] = agree[others, a] = squared <= 6 * _PAIR_SIGMAS**2
     return agree
 
 

@@ -95,6 +95,12 @@ class RelativeUncertainty:
         best = int(np.einsum("nii->n", ways[:, 3:, 3:]).argmin())
         return Prediction(self._along(best, i, j), ways[best])
 
+    def along(self, i: int, j: I64) -> tuple[F64, F64]:
+        """(n, 4, 4) T_i_j and (n, 6, 6) covariance, as `Prediction`, of several keyframes by odometry alone."""
+        T = se3.rigid(se3.inverse(self._poses[i])[None] @ self._poses[j])
+        to_j = se3.adjoint(se3.inverse(self._poses[j]))
+        return T, to_j @ self._apart(np.full(len(j), i), j) @ np.swapaxes(to_j, 1, 2)
+
     def consistent(self, one: RelativePose, others: Sequence[RelativePose]) -> Bool:
         """(n,) whether pairs of loop closures agree by the odometry alone: a cycle must come back to where it began.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -12,6 +12,9 @@ from mineloc.graph.batch import Solution
 from mineloc.graph.spread import spread
 from mineloc.localize.flown import without_points
 from mineloc.localize.localization import Clock, Localization
+
+POINTS_A_KEYFRAME = 250
+"""Enough to draw the mine; the map of a survey comes from `reconstruct`."""
 
 
 @dataclass(slots=True, eq=False)
@@ -33,9 +36,9 @@ class Kept:
     online_from: int = 0
 
     def add_keyframe(self, step: OdometryStep) -> Keyframe:
-        """Keep the keyframe of a step, which has one."""
+        """Keep the keyframe of a step, which has one, with the points that will be drawn; it itself."""
         assert step.keyframe is not None
-        self.keyframes.append(step.keyframe)
+        self.keyframes.append(drawn(step.keyframe))
         self.edges.append(step.relative_pose)
         return step.keyframe
 
@@ -75,3 +78,10 @@ class Kept:
             seconds=dict(self.clock.seconds),
             in_map=in_map,
         )
+
+
+def drawn(keyframe: Keyframe) -> Keyframe:
+    """With `POINTS_A_KEYFRAME` of its points, evenly through the cloud: the same ones on every run."""
+    n = len(keyframe.points_lidar)
+    pick = np.unique(np.linspace(0, n - 1, min(n, POINTS_A_KEYFRAME)).astype(np.int64))
+    return replace(keyframe, points_lidar=keyframe.points_lidar[pick])

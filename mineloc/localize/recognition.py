@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -17,6 +18,8 @@ from mineloc.places.contour_matrix import contour_matrix, matrix_likeness
 from mineloc.places.contour_search import ContourIndex, ContourMatch
 from mineloc.places.wall_contour import likeness_near
 
+_MAPS = 8
+"""Stored clouds that are kept ready for registration."""
 _TURN_RAD = np.radians(10.0)
 """The heading of a drone whose pose is known is known so well."""
 
@@ -55,7 +58,7 @@ class Recognizer:
         self._index = ContourIndex([one.contour for one in database.intersections], config.intersections)
         self._points = np.array([one.point_map for one in database.intersections]).reshape(-1, 3)
         self._same_id, self._same = -1, 0
-        self._maps: dict[int, PriorMap] = {}
+        self._maps: OrderedDict[int, PriorMap] = OrderedDict()
 
     def follow(self, keyframe: Keyframe, known: PoseFilter) -> Fix:
         """Take the next keyframe of a flight whose pose is known; the fix tells what was recognised, or why nothing.
@@ -241,8 +244,12 @@ class Recognizer:
         return ""
 
     def _map_of(self, known: Intersection) -> PriorMap:
+        """The stored cloud as patches; of the few that were needed last."""
         if known.id not in self._maps:
             self._maps[known.id] = PriorMap(_cloud_of(known), self._all.prior_map, self._all.odometry)
+        self._maps.move_to_end(known.id)
+        while len(self._maps) > _MAPS:
+            self._maps.popitem(last=False)
         return self._maps[known.id]
 
     def _stop(self, at: _At, reason: str) -> Fix:

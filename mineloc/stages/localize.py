@@ -25,8 +25,6 @@ from mineloc.stages.known_map import KnownMap
 from mineloc.stages.run_folder import write_run_folder
 from mineloc.stages.run_tables import fixes_table, pose_columns, sigmas
 
-POINTS_A_KEYFRAME = 250
-"""Enough to draw the mine; the map of a survey comes from `reconstruct`."""
 _SECTIONS = {
     "sweep",
     "keyframe",
@@ -209,11 +207,8 @@ def _keyframes(found: Localization) -> pl.DataFrame:
 def _points(found: Localization) -> pl.DataFrame:
     index, clouds = [np.zeros(0, np.int32)], [np.zeros((0, 3), np.float32)]
     for keyframe in found.keyframes:
-        # evenly through the cloud: the same points on every run
-        n = len(keyframe.points_lidar)
-        pick = np.unique(np.linspace(0, n - 1, min(n, POINTS_A_KEYFRAME)).astype(np.int64))
-        clouds.append(keyframe.points_lidar[pick])
-        index.append(np.full(len(pick), keyframe.index, np.int32))
+        clouds.append(keyframe.points_lidar)
+        index.append(np.full(len(keyframe.points_lidar), keyframe.index, np.int32))
     x, y, z = np.concatenate(clouds).T
     return pl.DataFrame({"keyframe": np.concatenate(index), "x_m": x, "y_m": y, "z_m": z})
 

@@ -2,7 +2,8 @@
 
 simulate? -> ingest -> localize (a method) -> evaluate, record
                                            -> report (all runs)
-                     -> reconstruct (a map of some flights)
+                    -> reconstruct (a map of some flights) -> database of its intersections
+                                                           -> localize (another flight in it)
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from mineloc.config import Config
 from mineloc.stages.stage import Input, Job, Stage
 from mineloc.store.digest import Json
 from mineloc.store.store import Outcome, Store
+from mineloc.survey.methods import KNOW_A_MAP
 from mineloc.survey.registry import DATABASE, EVALUATE, INGEST, LOCALIZE, RECONSTRUCT, RECORD, REPORT, SIMULATE
 from mineloc.survey.spec import Flight, Map, Survey
 
@@ -134,22 +136,22 @@ class Plan:
 
 
 def plan_survey(survey: Survey) -> Plan:
-    """All steps of a survey, flight after flight, the report last."""
+    """All steps of a survey, flight after flight, then maps and what is localized in them, the report last."""
     steps: list[Step] = []
     runs: list[Run] = []
+    in_maps: list[Step] = []
+    known = {one.name: one for one in survey.maps}
     for flight in survey.flights:
         steps.extend(_flight_steps(flight))
-        for method in survey.methods:
+        for method in survey.methods_of(flight):
             to = f"runs/{flight.name}-{method}"
-            steps.extend(_run_steps(flight, method, to))
+            own = known[flight.map] if flight.map is not None and method in KNOW_A_MAP else None
+            (steps if own is None else in_maps).extend(_run_steps(flight, method, to, own))
             runs.append(Run(flight.name, method, survey.out / to))
     for one in survey.maps:
-        steps.append(_map_step(one, survey.config))
-        if one.intersections:
-            to = f"maps/{one.name}.intersections.mcap"
-            made: dict[str, Wanted] = {"prior_map": Made(steps[-1].name)}
-            steps.append(Step(f"{one.name} database", "", DATABASE, to, made, survey.config))
-    localized = tuple(Made(step.name) for step in steps if step.stage is LOCALIZE)
+        steps.extend(_map_steps(one, survey.config))
+    steps.extend(in_maps)
+    localized = tuple(Made(_localize(run.flight, run.method)) for run in runs)
     title: dict[str, Json] = {"title": survey.title} if survey.title else {}
     steps.append(Step("report", "", REPORT, "report", {"runs": localized}, config=survey.config, arguments=title))
     return Plan(survey.out, survey.workers, tuple(steps), tuple(runs))
@@ -182,14 +184,19 @@ def _simulate_step(flight: Flight) -> Step:
     return Step(f"{flight.name} simulate", flight.name, SIMULATE, to, inputs, flight.config, arguments)
 
 
-def _run_steps(flight: Flight, method: str, to: str) -> Iterator[Step]:
-    localize = f"{flight.name} localize {method}"
+def _run_steps(flight: Flight, method: str, to: str, known: Map | None) -> Iterator[Step]:
+    localize = _localize(flight.name, method)
+    inputs: dict[str, Wanted] = {"flight": Made(f"{flight.name} ingest")}
+    if known is not None and method == "map_tracking":
+        inputs["prior_map"] = Made(_reconstruct(known))
+    if known is not None and known.intersections:
+        inputs["database"] = Made(_database(known))
     yield Step(
         localize,
         flight.name,
         LOCALIZE,
         to,
-        {"flight": Made(f"{flight.name} ingest")},
+        inputs,
         flight.config,
         arguments={"method": method},
         beside=(METRICS, RECORDING),
@@ -203,7 +210,19 @@ def _run_steps(flight: Flight, method: str, to: str) -> Iterator[Step]:
     yield Step(f"{flight.name} record {method}", flight.name, RECORD, f"{to}/{RECORDING}", seen, flight.config)
 
 
-def _map_step(one: Map, config: Config) -> Step:
+def _localize(flight: str, method: str) -> str:
+    return f"{flight} localize {method}"
+
+
+def _reconstruct(one: Map) -> str:
+    return f"{one.name} reconstruct"
+
+
+def _database(one: Map) -> str:
+    return f"{one.name} database"
+
+
+def _map_steps(one: Map, config: Config) -> Iterator[Step]:
     inputs: dict[str, Wanted | tuple[Wanted, ...]] = {
         "flights": tuple(Made(f"{name} ingest") for name in one.flights),
     }
@@ -211,7 +230,10 @@ def _map_step(one: Map, config: Config) -> Step:
         if path is not None:
             inputs[name] = path
     to = f"maps/{one.name}"
-    return Step(f"{one.name} reconstruct", "", RECONSTRUCT, to, inputs, config, arguments={"method": one.method})
+    yield Step(_reconstruct(one), "", RECONSTRUCT, to, inputs, config, arguments={"method": one.method})
+    if one.intersections:
+        made: dict[str, Wanted] = {"prior_map": Made(_reconstruct(one))}
+        yield Step(_database(one), "", DATABASE, f"{to}.intersections.mcap", made, config)
 
 
 def _group(given: Wanted | tuple[Wanted, ...]) -> tuple[Wanted, ...]:

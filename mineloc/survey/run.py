@@ -62,7 +62,7 @@ def _refuse_unknown_methods(survey: Survey) -> None:
     """Before anything is done; later runs find what comes before localization done, and the stage itself says it."""
     from mineloc.localize.method import method_named
 
-    for method in survey.methods:
+    for method in dict.fromkeys(name for flight in survey.flights for name in survey.methods_of(flight)):
         method_named(method)
 
 

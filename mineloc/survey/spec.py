@@ -18,7 +18,15 @@ mine = "demo"                       # ... or a mine to fly through: built-in nam
 [flight.config.simulate]            # configuration of this flight alone
 length_m = 500
 
-[[map]]                             # a map of some of the flights (of all without the key)
+[[flight]]
+name = "night"
+recording = "bags/night.mcap"
+methods = ["map_tracking"]          # in place of the survey's; [] for a flight that only makes a map
+map = "level-4"                     # in which methods that know a map localize it
+[flight.config.prior_map]
+start_m = [512_000, 4_398_000, -350] # where it begins; without it the intersections of the map find it
+
+[[map]]                             # a map of some of the flights (of all that use none, without the key)
 name = "level-4"
 flights = ["north"]
 control = "survey/targets.csv"      # surveyed targets, and where flights saw them; else what the flights bring
@@ -29,7 +37,7 @@ intersections = true                # also make the database of its intersection
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,6 +46,7 @@ from pydantic import Field
 
 from mineloc.config import Config, Section, layered_config, read_toml, validate
 from mineloc.errors import ConfigError
+from mineloc.survey.methods import KNOW_A_MAP
 
 NAME = r"[A-Za-z0-9][A-Za-z0-9._-]*"
 
@@ -51,6 +60,8 @@ class FlightSpec(Section):
     mine: str | None = None
     graph: str | None = None
     reference: str | None = None
+    methods: tuple[str, ...] | None = None
+    map: str | None = Field(default=None, description="of the survey, in which methods that know a map localize it")
     config: dict[str, Any] = Field(default_factory=dict)
 
 
@@ -84,6 +95,8 @@ class Flight:
     Attributes:
         mine: a file, or the name of a built-in mine.
         graph: the roadway graph of a mesh, in place of the one found in it.
+        methods: that localize it; None: the survey's.
+        map: name of the map for those that know one; None: it has none.
     """
 
     name: str
@@ -93,6 +106,8 @@ class Flight:
     graph: Path | None
     reference: Path | None
     config: Config
+    methods: tuple[str, ...] | None = None
+    map: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +136,7 @@ class Survey:
     Attributes:
         path: the survey file.
         out: the folder for the results.
+        methods: of flights that name none of their own.
         config: what holds for the survey as a whole (the report).
     """
 
@@ -133,6 +149,10 @@ class Survey:
     config: Config
     maps: tuple[Map, ...] = ()
 
+    def methods_of(self, flight: Flight) -> tuple[str, ...]:
+        """By which a flight is localized, each once."""
+        return self.methods if flight.methods is None else flight.methods
+
 
 def read_survey(path: Path, overrides: Iterable[str] = (), *, out: Path | None = None) -> Survey:
     """Read a survey file.
@@ -143,14 +163,14 @@ def read_survey(path: Path, overrides: Iterable[str] = (), *, out: Path | None =
 
     Raises:
         ConfigError: not TOML, an unknown key, a value that does not fit, a file that does not exist, two flights of
-            one name.
+            one name, a method that needs a map on a flight that has none or is part of it.
     """
     spec = validate(SurveySpec, read_toml(path), where=str(path))
     overrides = list(overrides)
     _refuse_equal_names(path, "flights", [flight.name for flight in spec.flight])
     _refuse_equal_names(path, "maps", [one.name for one in spec.map])
-    flights = tuple(_flight(path, flight, spec.config, overrides) for flight in spec.flight)
-    return Survey(
+    flights = tuple(_flight(path, flight, spec, overrides) for flight in spec.flight)
+    survey = Survey(
         path=path,
         title=spec.title,
         out=out if out is not None else path.parent / (spec.out or f"{path.stem}.results"),
@@ -158,8 +178,10 @@ def read_survey(path: Path, overrides: Iterable[str] = (), *, out: Path | None =
         workers=spec.workers,
         flights=flights,
         config=layered_config([spec.config], overrides, where=str(path)),
-        maps=tuple(_map(path, one, [flight.name for flight in flights]) for one in spec.map),
+        maps=tuple(_map(path, one, flights) for one in spec.map),
     )
+    _refuse_unmapped(survey)
+    return survey
 
 
 def slug(name: str) -> str:
@@ -167,7 +189,7 @@ def slug(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
 
 
-def _flight(path: Path, spec: FlightSpec, config: Mapping[str, Any], overrides: list[str]) -> Flight:
+def _flight(path: Path, spec: FlightSpec, survey: SurveySpec, overrides: list[str]) -> Flight:
     where = f"{path}: flight {spec.name}"
     if (spec.recording is None) == (spec.mine is None):
         raise ConfigError(where, "needs a recording or a mine", expected="one of the two", todo="correct the survey")
@@ -178,7 +200,9 @@ def _flight(path: Path, spec: FlightSpec, config: Mapping[str, Any], overrides: 
         mine=_mine(path, where, spec.mine),
         graph=_existing(path, where, "graph", spec.graph),
         reference=_existing(path, where, "reference", spec.reference),
-        config=layered_config([config, spec.config], overrides, where=where),
+        config=layered_config([survey.config, spec.config], overrides, where=where),
+        methods=None if spec.methods is None else tuple(dict.fromkeys(spec.methods)),
+        map=spec.map,
     )
 
 
@@ -200,21 +224,58 @@ def _existing(survey: Path, where: str, key: str, written: str | None) -> Path |
     return found
 
 
-def _map(path: Path, spec: MapSpec, flights: list[str]) -> Map:
+def _map(path: Path, spec: MapSpec, flights: Sequence[Flight]) -> Map:
     where = f"{path}: map {spec.name}"
+    names = [flight.name for flight in flights]
     for name in spec.flights:
-        if name not in flights:
+        if name not in names:
             raise ConfigError(
-                where, f"no flight {name!r}", expected=f"one of {', '.join(flights)}", todo="correct the survey"
+                where, f"no flight {name!r}", expected=f"one of {', '.join(names)}", todo="correct the survey"
             )
+    others = tuple(flight.name for flight in flights if flight.map != spec.name)
+    if not spec.flights and not others:
+        raise ConfigError(
+            where, "all flights are localized in it", expected="flights of which it is made", todo="name them"
+        )
     return Map(
         name=spec.name,
-        flights=spec.flights or tuple(flights),
+        flights=spec.flights or others,
         method=spec.method,
         control=_existing(path, where, "control", spec.control),
         observations=_existing(path, where, "observations", spec.observations),
         intersections=spec.intersections,
     )
+
+
+def _refuse_unmapped(survey: Survey) -> None:
+    """Methods that know a map have one, with a database where they need it, and not of the flight itself."""
+    if not any(survey.methods_of(flight) for flight in survey.flights):
+        raise ConfigError(survey.path, "no flight is localized", expected="a method on one flight", todo="name one")
+    for flight in survey.flights:
+        where = f"{survey.path}: flight {flight.name}"
+        needy = [method for method in survey.methods_of(flight) if method in KNOW_A_MAP]
+        if flight.map is None:
+            if needy:
+                raise ConfigError(where, f"{needy[0]} needs a map", expected='map = "NAME" of a [[map]]', todo="add it")
+            continue
+        chosen = next((one for one in survey.maps if one.name == flight.map), None)
+        if chosen is None:
+            names = ", ".join(one.name for one in survey.maps) or "a [[map]] in the survey"
+            raise ConfigError(where, f"no map {flight.map!r}", expected=names, todo="correct the survey")
+        if flight.name in chosen.flights:
+            raise ConfigError(
+                where,
+                f"map {chosen.name!r} is made of it",
+                expected="a map of other flights",
+                todo="correct the survey",
+            )
+        if "intersections_map" in needy and not chosen.intersections:
+            raise ConfigError(
+                where,
+                f"intersections_map needs the intersections of map {chosen.name!r}",
+                expected="intersections = true there",
+                todo="add it",
+            )
 
 
 def _refuse_equal_names(path: Path, what: str, names: list[str]) -> None:

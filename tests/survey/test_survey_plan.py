@@ -8,8 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mineloc.config import Config, layered_config
+from mineloc.localize import METHODS
 from mineloc.stages.stage import Input, Job
 from mineloc.store.objects import Ref
+from mineloc.survey.methods import KNOW_A_MAP
 from mineloc.survey.plan import Made, plan_survey
 from mineloc.survey.registry import DATABASE, EVALUATE, INGEST, LOCALIZE, RECONSTRUCT, RECORD, REPORT, SIMULATE
 from mineloc.survey.spec import Flight, Map, Survey
@@ -66,6 +68,25 @@ def test_a_map_is_made_of_its_flights_and_targets():
     assert plan.step("m database").needs() == ["m reconstruct"]
     assert plan.step("m database").to == "maps/m.intersections.mcap"
     assert plan.steps[-1].needs() == ["a localize odometry", "b localize odometry"]
+
+
+def test_a_flight_is_localized_in_the_map_of_others():
+    maps = (Map("m", ("a",), "odometry_loops", None, None, intersections=True),)
+    known = flight("b", recording=Path("b.mcap"), map="m", methods=("odometry", "map_tracking", "intersections_map"))
+    plan = plan_survey(replace(survey(flight("a", mine="demo", methods=()), known), maps=maps))
+    assert plan.step("b localize odometry").needs() == ["b ingest"]
+    assert plan.step("b localize map_tracking").needs() == ["b ingest", "m reconstruct", "m database"]
+    assert plan.step("b localize intersections_map").needs() == ["b ingest", "m database"]
+    assert [run.method for run in plan.runs] == ["odometry", "map_tracking", "intersections_map"]
+    assert plan.steps[-1].needs() == [f"b localize {run.method}" for run in plan.runs]
+    seen: set[str] = set()
+    for step in plan.steps:
+        assert set(step.needs()) <= seen
+        seen.add(step.name)
+
+
+def test_plans_know_which_methods_know_a_map():
+    assert {name for name, method in METHODS.items() if method.tracks is not None} == KNOW_A_MAP
 
 
 def test_the_report_reads_all_runs_in_order():

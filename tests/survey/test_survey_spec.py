@@ -96,6 +96,46 @@ def test_what_is_wrong_is_said_on_one_line(folder, old, new, said):
     assert "\n" not in str(error.value)
 
 
+MAPPED = """
+methods = ["odometry", "map_tracking"]
+[[flight]]
+name = "mapping"
+mine = "demo"
+methods = []
+[[flight]]
+name = "night"
+mine = "demo"
+map = "level4"
+[[map]]
+name = "level4"
+"""
+
+
+def test_a_flight_is_localized_in_a_map_of_the_others(folder):
+    found = survey(folder, MAPPED)
+    assert [found.methods_of(flight) for flight in found.flights] == [(), ("odometry", "map_tracking")]
+    assert found.flights[1].map == "level4"
+    assert found.maps[0].flights == ("mapping",)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('map = "level4"', "", "flight night: map_tracking needs a map"),
+        ('map = "level4"', 'map = "level5"', "no map 'level5'; expected level4"),
+        ("[[map]]", '[[map]]\nflights = ["night"]', "flight night: map 'level4' is made of it"),
+        ("methods = []", 'map = "level4"', "map level4: all flights are localized in it"),
+        ('"map_tracking"', '"intersections_map"', "needs the intersections of map 'level4'"),
+        ('map = "level4"', "methods = []", "no flight is localized"),
+    ],
+)
+def test_a_method_that_knows_a_map_has_one(folder, old, new, said):
+    assert old in MAPPED
+    with pytest.raises(ConfigError) as error:
+        survey(folder, MAPPED.replace(old, new, 1))
+    assert said in str(error.value)
+
+
 def test_a_survey_that_is_missing_is_said(tmp_path):
     with pytest.raises(ConfigError, match=r"gone\.toml: no such file"):
         read_survey(tmp_path / "gone.toml")
