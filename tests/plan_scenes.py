@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from map_clouds import cloud_of
 
-from mineloc.data import F32, F64, MapCloud
+from mineloc import se3
+from mineloc.data import F32, F64, Keyframe, MapCloud, RelativePose
 from mineloc.roadways.centre_lines import centre_lines
 from mineloc.roadways.mapped import MappedRoadway, MappedRoadways
 from mineloc.roadways.sheet import Sheet, link
@@ -102,3 +104,37 @@ def mapped(sheet: Sheet) -> MappedRoadways:
         for road in graph.roadways
     )
     return MappedRoadways(graph.nodes_m, roads, 1.2)
+
+
+def surveyed() -> MapCloud:
+    """What a mapping flight sees along all roadways of `TwoIntersections`: a point a cell of 0.1 m."""
+    rng = np.random.default_rng(0)
+    plan = TwoIntersections()
+    ways = [(x, 0.0) for x in np.arange(-18, 48, 1.5)] + [(0.0, y) for y in np.arange(1.5, 18, 1.5)]
+    ways += [(30.0, y) for y in np.arange(-18, 18, 1.5)]
+    parts = [plan.sweep(np.array(at), 0.0, rng) + np.array([*at, SENSOR_M]) for at in ways]
+    points = np.concatenate(parts)
+    points = points[np.unique(np.floor(points * 10), axis=0, return_index=True)[1]]
+    return cloud_of(points)
+
+
+def flown(plan: Plan, start_m: float, end_m: float, *, seed: int = 3) -> tuple[list[Keyframe], F64]:
+    """Keyframes a metre apart along x, odometry in another frame than the map; and their true poses."""
+    rng = np.random.default_rng(seed)
+    step = 1.0 if end_m > start_m else -1.0
+    heading = 0.0 if step > 0 else np.pi
+    truth = np.array([se3.exp(np.array([0, 0, heading, 0, 0, 0]))] * int(abs(end_m - start_m)))
+    truth[:, 0, 3] = start_m + step * np.arange(len(truth))
+    truth[:, 2, 3] = SENSOR_M
+    T_odom_map = se3.exp(np.array([0, 0, 1.1, 40.0, -7.0, 3.0]))
+    return [Keyframe(k, k, T_odom_map @ T, plan.sweep(T[:2, 3], heading, rng)) for k, T in enumerate(truth)], truth
+
+
+def edges_of(keyframes: Sequence[Keyframe]) -> list[RelativePose | None]:
+    """What exact odometry says of its own exactness: a tenth of a degree and a centimetre a keyframe."""
+    information = np.diag([np.radians(0.1) ** -2] * 3 + [0.01**-2] * 3)
+    edges: list[RelativePose | None] = [None]
+    for before, here in pairwise(keyframes):
+        T = se3.inverse(before.T_odom_lidar) @ here.T_odom_lidar
+        edges.append(RelativePose(before.index, here.index, T, information))
+    return edges

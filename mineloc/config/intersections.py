@@ -38,6 +38,9 @@ class IntersectionsConfig(Section):
     cloud_radius_m: float = Field(default=15.0, gt=0, description="of the dense cloud that is kept")
     cloud_height_m: float = Field(default=6.0, gt=0, description="points so far above or below belong to other levels")
     threshold_floor: float = Field(default=0.5, ge=0, le=1, description="least contour similarity of a candidate")
+    threshold_ceiling: float = Field(
+        default=0.65, ge=0, le=1, description="no more is asked: an intersection seen again is hardly more like itself"
+    )
     threshold_quantile: float = Field(default=0.99, ge=0, le=1, description="of pairs of different intersections")
     twin_matrix: float = Field(default=0.6, ge=0, le=1, description="matrix similarity from which on two are twins")
     branch_match_deg: float = Field(default=20.0, gt=0, description="two bearings so near are those of one branch")

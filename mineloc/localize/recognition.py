@@ -57,7 +57,7 @@ class Recognizer:
         self._watch = JunctionWatch(config.intersections)
         self._index = ContourIndex([one.contour for one in database.intersections], config.intersections)
         self._points = np.array([one.point_map for one in database.intersections]).reshape(-1, 3)
-        self._same_id, self._same = -1, 0
+        self._same: dict[int, int] = {}
         self._maps: OrderedDict[int, PriorMap] = OrderedDict()
 
     def follow(self, keyframe: Keyframe, known: PoseFilter) -> Fix:
@@ -90,16 +90,24 @@ class Recognizer:
             candidates, reason = self._told_apart(candidates, look, at)  # step 6
         if not candidates:
             return [self._stop(at, reason)]
-        best = candidates[0].known
-        self._same = self._same + 1 if best.id == self._same_id else 1  # step 7
-        self._same_id = best.id
-        at.scores["same"] = float(self._same)
-        needed = self._config.same_needed if at.known is None else self._config.same_needed_known
-        if self._same < needed:  # step 8
-            reason = f"{self._same} keyframes agree, at least {needed} needed (step 8)"
-            return [_refused(at, reason, target=best.name)]
-        self._same = 0
-        return self._all_verified(candidates, look, at)  # step 9
+        steady = self._steady(candidates, at)  # step 7
+        if not steady:  # step 8
+            reason = f"{at.scores['same']:.0f} keyframes agree, at least {self._needed(at)} needed (step 8)"
+            return [_refused(at, reason, target=candidates[0].known.name)]
+        return self._all_verified(steady, look, at)  # step 9
+
+    def _steady(self, candidates: Sequence[_Candidate], at: _At) -> list[_Candidate]:
+        """Those that as many keyframes in a row have seen as are needed; these begin anew."""
+        ids = {one.known.id for one in candidates}
+        self._same = {id: self._same.get(id, 0) + 1 for id in sorted(ids)}
+        at.scores["same"] = float(max(self._same.values()))
+        steady = [one for one in candidates if self._same[one.known.id] >= self._needed(at)]
+        for one in steady:
+            self._same[one.known.id] = 0
+        return steady
+
+    def _needed(self, at: _At) -> int:
+        return self._config.same_needed if at.known is None else self._config.same_needed_known
 
     def _candidates(self, look: Look, at: _At) -> tuple[list[_Candidate], str]:
         """Intersections whose contour is like this one and that may be here, the most alike first; or why none."""
@@ -254,7 +262,7 @@ class Recognizer:
 
     def _stop(self, at: _At, reason: str) -> Fix:
         """Refused before an intersection had a name: those before it no longer count."""
-        self._same_id, self._same = -1, 0
+        self._same = {}
         return _refused(at, reason)
 
 

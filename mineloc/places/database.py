@@ -23,18 +23,18 @@ def database_of(
     """Compare every intersection with every other, and draw the threshold from that; the first version of a database.
 
     The threshold lies above nearly all pairs of different intersections, but not above the likeness that one has with
-    itself seen from elsewhere; pairs above it are for the matrix, the neighbours and registration to tell apart, and
+    itself seen from elsewhere, in a mine of equal junctions no more than in any other; pairs above it are for the matrix, the neighbours and registration to tell apart, and
     those that the matrix does not tell apart are twins.
 
     Args:
         intersections: by rising id.
-        config: `threshold_floor`, `threshold_quantile`, `twin_matrix`, `branch_match_deg`.
+        config: `threshold_floor`, `threshold_ceiling`, `threshold_quantile`, `twin_matrix`, `branch_match_deg`.
         grid_origin_m, is_grid, map_sha256: of the map.
     """
     contour, matrix = similarities(intersections, config)
     different = contour[~np.eye(len(contour), dtype=np.bool_)]
     quantile = float(np.quantile(different, config.threshold_quantile)) if len(different) else 0.0
-    threshold = max(config.threshold_floor, quantile)
+    threshold = float(np.clip(quantile, config.threshold_floor, config.threshold_ceiling))
     twins = [
         (intersections[i].id, intersections[j].id)
         for i in range(len(contour))

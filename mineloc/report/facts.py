@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections import Counter
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -17,6 +16,7 @@ from mineloc.config import EvaluateConfig
 from mineloc.io.health import SCHEMA as HEALTH_SCHEMA
 from mineloc.report.along import Way
 from mineloc.report.limits import limits_of_validity
+from mineloc.report.recognitions import map_facts, recognition_facts
 from mineloc.stages.comparison import Comparison, compare
 from mineloc.stages.run_folder import RunFolder
 from mineloc.stages.stretches import Stretch, degenerate_stretches, untrusted_stretches
@@ -73,7 +73,8 @@ def run_facts(run: RunFolder, letter: str, config: EvaluateConfig) -> RunFacts:
             "untrusted": [_stretch(one, way) for one in untrusted_stretches(run.sweeps)],
             "degenerate": [_stretch(one, way) for one in degenerate_stretches(run.sweeps)],
         },
-        "recognitions": _recognitions(run),
+        "map": map_facts(run, way),
+        "recognitions": recognition_facts(run, way),
         "timing": _timing(run),
     }
     values["limits"] = limits_of_validity(values, has_reference=run.reference is not None)
@@ -157,21 +158,6 @@ def _stretch(one: Stretch, way: Way) -> dict[str, Any]:
         "duration_s": (one.end_ns - one.start_ns) * 1e-9,
         "sweeps": one.sweeps,
         "reason": one.reason,
-    }
-
-
-def _recognitions(run: RunFolder) -> dict[str, Any] | None:
-    if run.fixes.is_empty():
-        return None
-    refused = run.fixes.filter(~run.fixes["trusted"])
-    reasons = Counter(refused["reason"].to_list())
-    return {
-        "accepted": len(run.fixes) - len(refused),
-        "refused": len(refused),
-        # the most frequent first, ties by name
-        "reasons": [
-            {"reason": r, "count": n} for r, n in sorted(reasons.items(), key=lambda item: (-item[1], item[0]))
-        ],
     }
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from mineloc.metrics.recognition import PASSED_M, WRONG_DEG, WRONG_M
+
 _ALIGNED = {
     "none": "Nothing was aligned: estimate and reference share one frame.",
     "origin": "In figures and headline the first estimated pose is laid on the reference's; the error that grows from "
@@ -20,7 +22,8 @@ def limits_of_validity(values: Mapping[str, Any], *, has_reference: bool) -> lis
         values: as `RunFacts.values`, without the limits.
         has_reference: whether the run brought one, comparable or not.
     """
-    limits = _of_accuracy(values) if values["accuracy"] else _without_reference(values, has_reference=has_reference)
+    limits = _of_map(values)
+    limits += _of_accuracy(values) if values["accuracy"] else _without_reference(values, has_reference=has_reference)
     registration = values["registration"]
     if registration["degenerate_share"] > 0:
         limits.append(
@@ -39,6 +42,35 @@ def limits_of_validity(values: Mapping[str, Any], *, has_reference: bool) -> lis
     return limits + _of_data(values)
 
 
+def _of_map(values: Mapping[str, Any]) -> list[str]:
+    """What a map that the flight was given does not say of it."""
+    known, recognitions = values["map"], values["recognitions"]
+    if known is None:
+        return []
+    if not known["found"]:
+        last = known["last_refusals"]
+        why = f" The last keyframes were refused: {'; '.join(one['reason'] for one in last)}." if last else ""
+        return [
+            "The flight was not found in the map: its positions are in a frame of their own, which begins where the "
+            "flight does. They say how it flew, not where in the mine. Which intersections it passed could not be "
+            f"decided.{why}"
+        ]
+    if recognitions is None or recognitions["places"] is None:
+        return []
+    if recognitions["score"] is None:
+        return [
+            "Which intersections were passed is not known without a reference in the map: what was recognised was not "
+            "confirmed, and what was missed is not counted."
+        ]
+    limits = [
+        f"An intersection counts as passed when the reference comes within {PASSED_M:g} m of it, and a recognition as "
+        f"wrong when its pose is off by more than {WRONG_M:g} m or {WRONG_DEG:g}°."
+    ]
+    if not known["is_grid"]:
+        limits.append("The map does not stand in the mine grid: the reference is taken to be in the map's own frame.")
+    return limits
+
+
 def _of_accuracy(values: Mapping[str, Any]) -> list[str]:
     smoothed = values["accuracy"]["smoothed"]
     limits = [
@@ -46,6 +78,8 @@ def _of_accuracy(values: Mapping[str, Any]) -> list[str]:
         "error and any error of the clock.",
     ]
     limits.append(_ALIGNED[values["shown_alignment"]])
+    if values["map"] and not values["map"]["found"]:
+        limits.append("With nothing aligned, two frames are compared that have nothing to do with each other.")
     covered = smoothed["coverage"]["time"]
     if covered < 0.9995:
         limits.append(f"The scores speak of {_percent(covered)} of the reference's duration, not of the rest.")
@@ -80,10 +114,19 @@ def _of_data(values: Mapping[str, Any]) -> list[str]:
         )
     elif health.get("recovered"):
         limits.append("The flight was made from a damaged recording and may lack something.")
-    limits.append(
-        "Coordinates are local metres; no mine grid or height datum is implied. Speeds depend on the computer."
-    )
+    limits.append(f"{_coordinates(values)} Speeds depend on the computer.")
     return limits
+
+
+def _coordinates(values: Mapping[str, Any]) -> str:
+    known = values["map"]
+    if not known or not known["found"] or not known["is_grid"]:
+        return "Coordinates are local metres; no mine grid or height datum is implied."
+    x, y, z = known["grid_origin_m"]
+    return (
+        f"Coordinates of the figures are the map's: the mine grid less x {x:.0f} m, y {y:.0f} m, z {z:.0f} m. Those of "
+        "the table of recognitions are in the mine grid."
+    )
 
 
 def _percent(share: float) -> str:

@@ -67,13 +67,15 @@ def frame_of(comparison: Comparison | None) -> F64:
 
 
 def _shown_alignment(run: RunFolder, config: EvaluateConfig) -> Alignment:
-    """In a prior map nothing is aligned, for the estimate lives in the map's frame.
+    """In a map that stands in the mine grid nothing is aligned: estimate and reference are told in its frame.
 
-    Without one the first pose is laid on the reference's: the error begins at zero and grows as the drift does.
+    Else the first pose is laid on the reference's: the error begins at zero and grows as the drift does. So it is too
+    for a flight that did not find itself in the map, and in a map without a grid, whose frame is that of another flight.
     """
     if config.shown_alignment != "auto":
         return config.shown_alignment
-    return "none" if run.manifest.get("prior_map") else "origin"
+    known = run.manifest.get("map")
+    return "none" if known and known["is_grid"] and known.get("found", True) else "origin"
 
 
 def _drift(origin: AbsoluteError) -> Drift:

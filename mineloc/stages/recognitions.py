@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +14,8 @@ from mineloc.data import Trajectory
 from mineloc.metrics.recognition import RecognitionScore, recognition_score
 from mineloc.stages.run_folder import RunFolder
 from mineloc.stages.run_tables import poses_of
+
+_NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,8 +78,15 @@ def recognition_of(run: RunFolder, reference: Trajectory) -> Recognition | None:
 def refusals_by_step(fixes: pl.DataFrame) -> dict[str, int]:
     """How many keyframes stopped at each step, by its name."""
     reasons = fixes.filter(~pl.col("trusted"))["reason"].to_list()
-    return dict(sorted(Counter(_step(reason) for reason in reasons).items()))
+    return dict(sorted(Counter(step_of(reason) for reason in reasons).items()))
 
 
-def _step(reason: str) -> str:
+def step_of(reason: str) -> str:
+    """The step that a reason names at its end; `other` when it names none."""
     return reason.rpartition("(")[2].rstrip(")") if reason.endswith(")") else "other"
+
+
+def wording_of(reason: str) -> str:
+    """A reason without its numbers, but for that of its step: the same for all that stopped for the same cause."""
+    text, bracket, step = reason.rpartition(" (") if reason.endswith(")") else (reason, "", "")
+    return _NUMBER.sub("…", text) + bracket + step

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from map_clouds import cloud_of
-from plan_scenes import SENSOR_M, Plan, TwoIntersections, drawn, mapped
+from plan_scenes import Plan, TwoIntersections, flown
 
 from mineloc import se3
 from mineloc.config import Config
-from mineloc.data import F64, Fix, IntersectionDatabase, Keyframe, MapCloud
+from mineloc.data import F64, Fix, IntersectionDatabase
 from mineloc.localize.pose_filter import PoseFilter
 from mineloc.localize.recognition import Recognizer
-from mineloc.places.database import database_of
-from mineloc.places.segmentation import intersections_of
 
 CONFIG = Config()
 
@@ -22,38 +19,6 @@ def at(T_map_lidar: F64, *, sigma_m: float = 0.5, sigma_deg: float = 3.0) -> Pos
     """What is known of a drone that is there."""
     covariance = np.diag([np.radians(sigma_deg) ** 2] * 3 + [sigma_m**2] * 3)
     return PoseFilter(T_map_lidar, covariance, CONFIG.graph)
-
-
-def surveyed() -> MapCloud:
-    """What a mapping flight sees along all roadways: a point a cell of 0.1 m."""
-    rng = np.random.default_rng(0)
-    plan = TwoIntersections()
-    ways = [(x, 0.0) for x in np.arange(-18, 48, 1.5)] + [(0.0, y) for y in np.arange(1.5, 18, 1.5)]
-    ways += [(30.0, y) for y in np.arange(-18, 18, 1.5)]
-    parts = [plan.sweep(np.array(at), 0.0, rng) + np.array([*at, SENSOR_M]) for at in ways]
-    points = np.concatenate(parts)
-    points = points[np.unique(np.floor(points * 10), axis=0, return_index=True)[1]]
-    return cloud_of(points)
-
-
-@pytest.fixture(scope="module")
-def database() -> IntersectionDatabase:
-    sheet = drawn()
-    found = intersections_of(sheet, surveyed(), mapped(sheet), CONFIG.intersections)
-    facts = {"grid_origin_m": np.zeros(3), "is_grid": False, "map_sha256": ""}
-    return database_of(found, CONFIG.intersections, **facts)
-
-
-def flown(plan: Plan, start_m: float, end_m: float) -> tuple[list[Keyframe], F64]:
-    """Keyframes a metre apart along x, odometry in another frame than the map; and their true poses."""
-    rng = np.random.default_rng(3)
-    step = 1.0 if end_m > start_m else -1.0
-    heading = 0.0 if step > 0 else np.pi
-    truth = np.array([se3.exp(np.array([0, 0, heading, 0, 0, 0]))] * int(abs(end_m - start_m)))
-    truth[:, 0, 3] = start_m + step * np.arange(len(truth))
-    truth[:, 2, 3] = SENSOR_M
-    T_odom_map = se3.exp(np.array([0, 0, 1.1, 40.0, -7.0, 3.0]))
-    return [Keyframe(k, k, T_odom_map @ T, plan.sweep(T[:2, 3], heading, rng)) for k, T in enumerate(truth)], truth
 
 
 def errors_at(fixes: list[Fix], truth: F64, name: str) -> list[F64]:

@@ -40,8 +40,10 @@ def test_a_run_is_drawn_by_its_first_pose_but_in_a_prior_map_as_it_is(tmp_path, 
     mapped = tmp_path / "mapped"
     shutil.copytree(source, mapped)
     manifest = json.loads((mapped / "manifest.json").read_text())
-    (mapped / "manifest.json").write_text(json.dumps(manifest | {"prior_map": "ab" * 32}))
-    assert compare(RunFolder.open(mapped), EvaluateConfig())["smoothed"].shown.alignment == "none"
+    for is_grid, found, alignment in ((True, True, "none"), (True, False, "origin"), (False, True, "origin")):
+        known = {"manifest_sha256": "ab" * 32, "grid_origin_m": [0.0] * 3, "is_grid": is_grid, "found": found}
+        (mapped / "manifest.json").write_text(json.dumps(manifest | {"map": known}))
+        assert compare(RunFolder.open(mapped), EvaluateConfig())["smoothed"].shown.alignment == alignment
 
 
 def test_an_alignment_that_the_poses_leave_open_is_replaced_and_told(synthetic_run):
