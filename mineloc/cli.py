@@ -213,7 +213,7 @@ def localize(
         from mineloc.view.run import record_run
 
         with progress_bar("recording") as progress:
-            record_run(out, out / "run.rrd", flight=flight, config=settings, progress=progress)
+            record_run(out, out / "run.rrd", flight=flight, database=database, config=settings, progress=progress)
     if as_json:
         sys.stdout.write(json.dumps(result.to_dict(), indent=1) + "\n")
         return
@@ -313,6 +313,9 @@ def report(
 def view(
     what: Annotated[Path, typer.Argument(help="A run or map folder, a flight (.mcap), or a recording (.rrd).")],
     flight: Annotated[Path | None, typer.Option("--flight", help="The run's flight: its sweeps are shown.")] = None,
+    database: Annotated[
+        Path | None, typer.Option("--database", help="The run's database: why it recognised what it did.")
+    ] = None,
     save: Annotated[Path | None, typer.Option("--save", help="Write the recording (.rrd), open no window.")] = None,
     screenshot: Annotated[Path | None, typer.Option("--screenshot", help="Write a picture (.png).")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
@@ -327,7 +330,14 @@ def view(
     settings = load_config(config, overrides or ())
     with progress_bar("view") as progress:
         written = show(
-            what, flight=flight, save=save, picture=screenshot, overwrite=overwrite, config=settings, progress=progress
+            what,
+            flight=flight,
+            database=database,
+            save=save,
+            picture=screenshot,
+            overwrite=overwrite,
+            config=settings,
+            progress=progress,
         )
     for path in written:
         typer.echo(path)

@@ -10,7 +10,6 @@ import numpy as np
 from mineloc import se3
 from mineloc.config import IntersectionsConfig
 from mineloc.data import F32, F64, Keyframe, WallContour
-from mineloc.localize.keyframe_clouds import levelled
 from mineloc.places.branches import Junction, find_junctions
 from mineloc.places.free_grid import FreeGrid, PlanView, free_grid, plan_view
 from mineloc.places.wall_contour import wall_contour
@@ -21,16 +20,18 @@ _FLOOR_M = 2.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """One keyframe of the window: its levelled points, its plan, and where its level frame is in odometry."""
+    """One keyframe of the window: its points in the axes of odometry, its plan, and where it is in odometry."""
 
     cloud_level: F32
     view: PlanView
-    T_odom_level: F64
+    at_m: F64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Look:
     """The junction that the newest keyframe and those before it see.
+
+    The level frame has its origin in the lidar and the axes of odometry, which is levelled.
 
     Attributes:
         junction: the nearest within reach, in the level frame of the newest keyframe.
@@ -74,11 +75,11 @@ class JunctionWatch:
             keyframe: with points; odometry levels it.
         """
         c = self._config
-        level = levelled(keyframe.T_odom_lidar)
+        level = se3.from_rt(keyframe.T_odom_lidar[:3, :3], np.zeros(3))
+        at_m = keyframe.T_odom_lidar[:3, 3]
         cloud = se3.apply(level, keyframe.points_lidar).astype(np.float32)
-        here = _Seen(cloud, plan_view(cloud, c), se3.rigid(keyframe.T_odom_lidar @ se3.inverse(level)))
-        self._window.append(here)
-        grid = self._free = self._grid()
+        self._window.append(_Seen(cloud, plan_view(cloud, at_m[:2], c), at_m))
+        grid = self._free = free_grid([seen.view for seen in self._window], at_m[:2], c)
         near = [one for one in find_junctions(grid, c) if np.linalg.norm(one.point_m) < c.recognise_m]
         if not near:
             return None
@@ -98,23 +99,16 @@ class JunctionWatch:
 
     def stacked(self) -> F64:
         """(n, 3) points of the window in the level frame of the newest keyframe (paper A, eq. 20)."""
-        places = self._places()
-        return np.concatenate([se3.apply(T, seen.cloud_level) for T, seen in zip(places, self._window, strict=True)])
-
-    def _grid(self) -> FreeGrid:
-        return free_grid([seen.view for seen in self._window], np.array(self._places()), self._config)
-
-    def _places(self) -> list[F64]:
-        back = se3.inverse(self._window[-1].T_odom_level)
-        return [back @ seen.T_odom_level for seen in self._window]
+        here = self._window[-1].at_m
+        return np.concatenate([seen.cloud_level + (seen.at_m - here) for seen in self._window])
 
     def _floor_under(self, junction: Junction) -> float:
         heights: list[F64] = []
-        for T, seen in zip(self._places(), self._window, strict=True):
-            at = se3.apply(se3.inverse(T), np.array([[*junction.point_m, 0.0]]))[0, :2]
-            away = seen.cloud_level[:, :2] - at.astype(np.float32)
+        for seen in self._window:
+            moved = seen.at_m - self._window[-1].at_m
+            away = seen.cloud_level[:, :2] - (junction.point_m - moved[:2]).astype(np.float32)
             near = np.einsum("ij,ij->i", away, away) < _FLOOR_M**2
-            heights.append(seen.cloud_level[near, 2] + T[2, 3])
+            heights.append(seen.cloud_level[near, 2] + moved[2])
         found = np.concatenate(heights)
         if not len(found):
             found = self._window[-1].cloud_level[:, 2]

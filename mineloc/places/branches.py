@@ -10,7 +10,7 @@ from scipy.ndimage import label
 
 from mineloc.compiled import njit
 from mineloc.config import IntersectionsConfig
-from mineloc.data import F64, I32, Bool
+from mineloc.data import F64, I32, I64, Bool
 from mineloc.places.clearance import Clearance, clearance_of, flood
 from mineloc.places.free_grid import FreeGrid
 
@@ -185,9 +185,9 @@ def _arcs(grid: FreeGrid, free: Bool, centre_m: F64, radius_m: float, config: In
     width = 0.5 * config.ring_width_m / grid.cell_m
     filled = ring(free, at[1], at[0], radius_m / grid.cell_m, width, _BEARINGS)
     step_m = 2 * np.pi * radius_m / _BEARINGS
-    filled = _closed_ring(filled, max(1, round(1.5 * grid.cell_m / step_m)))
     out: list[_Arc] = []
-    for first, last in _runs(filled):
+    # cells are coarser than bearings near the centre: small gaps are none
+    for first, last in runs_on(filled, max(1, round(1.5 * grid.cell_m / step_m))).tolist():
         half = np.pi * (last - first) / _BEARINGS
         chord = 2.0 * radius_m * float(np.sin(min(half, 0.5 * np.pi)))
         if chord >= config.min_branch_m:
@@ -243,27 +243,51 @@ def ring_plainly(free: Bool, row: float, column: float, radius: float, half_widt
     return filled
 
 
-def _closed_ring(filled: Bool, gap: int) -> Bool:
-    """Gaps of at most `gap` bins between filled ones are filled: cells are coarser than bearings near the centre."""
+@njit(cache=True, nogil=True)
+def runs_on(filled: Bool, gap: int) -> I64:
+    """(k, 2) first bin and end of the runs on a ring, gaps of at most `gap` bins closed.
+
+    The end lies beyond the ring's where a run goes around; a ring that is full, or empty, has none.
+    """
+    n = len(filled)
+    none = np.zeros((0, 2), np.int64)
+    # begin behind the longest gap: no run goes over it
+    start, longest, run = -1, 0, 0
+    for i in range(2 * n):
+        if filled[i % n]:
+            if run > longest:
+                start, longest = i % n, run
+            run = 0
+        else:
+            run += 1
+    if start < 0 or longest <= gap or longest >= n:
+        return none
+    out = np.empty((n, 2), np.int64)
+    count, last = 0, -1
+    for i in range(start, start + n):
+        if not filled[i % n]:
+            continue
+        if last < 0 or i - last > gap + 1:
+            out[count, 0] = i
+            count += 1
+        out[count - 1, 1] = i + 1
+        last = i
+    return out[:count].copy()
+
+
+def runs_plainly(filled: Bool, gap: int) -> I64:
+    """`runs_on` in plain numpy: what the kernel is held to; the runs in another order."""
     where = np.flatnonzero(filled)
     if not len(where):
-        return filled.copy()
+        return np.zeros((0, 2), np.int64)
     n = len(filled)
-    last = np.maximum.accumulate(np.where(filled, np.arange(n), -1))
-    following = np.minimum.accumulate(np.where(filled, np.arange(n), 2 * n)[::-1])[::-1]
-    last = np.where(last < 0, where[-1] - n, last)
-    following = np.where(following == 2 * n, where[0] + n, following)
-    return following - last <= gap + 1
-
-
-def _runs(filled: Bool) -> list[tuple[int, int]]:
-    """(first, end) of the runs on a ring, the end beyond the ring's where a run goes around; a full ring is none."""
-    if filled.all() or not filled.any():
-        return []
-    start = int(np.flatnonzero(~filled)[0])
-    turned = np.roll(filled, -start)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], turned, [False]]).astype(np.int8)))
-    return [(int(a) + start, int(b) + start) for a, b in edges.reshape(-1, 2)]
+    ahead = np.diff(np.append(where, where[0] + n))
+    if (ahead <= gap + 1).all():
+        return np.zeros((0, 2), np.int64)
+    ends = np.flatnonzero(ahead > gap + 1)
+    firsts = where[(ends + 1) % len(where)]
+    lasts = where[np.roll(ends, -1)]
+    return np.column_stack([firsts, np.where(lasts < firsts, lasts + n, lasts) + 1])
 
 
 def _branch(chain: list[_Arc], centre_m: F64) -> Branch:

@@ -23,8 +23,8 @@ def database_of(
     """Compare every intersection with every other, and draw the threshold from that; the first version of a database.
 
     The threshold lies above nearly all pairs of different intersections, but not above the likeness that one has with
-    itself seen from elsewhere, in a mine of equal junctions no more than in any other; pairs above it are for the matrix, the neighbours and registration to tell apart, and
-    those that the matrix does not tell apart are twins.
+    itself seen from elsewhere, in a mine of equal junctions no more than in any other. Pairs above it are for the
+    matrix, the neighbours and registration to tell apart, and those that the matrix does not tell apart are twins.
 
     Args:
         intersections: by rising id.

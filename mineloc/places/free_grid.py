@@ -14,12 +14,14 @@ import numpy as np
 
 from mineloc.compiled import njit
 from mineloc.config import IntersectionsConfig
-from mineloc.data import F32, F64, I32, U8, Bool, Sight
+from mineloc.data import F32, F64, I32, I64, U8, Bool, Sight
 
 _BEAMS = 720
 """Bearings; in each the farthest return tells how far it is open."""
 _SHORT_M = 0.15
 """A beam opens the cells up to so far before its end."""
+_STEP = 0.7
+"""Cells between two places on a beam."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,51 +51,61 @@ class FreeGrid:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlanView:
-    """One keyframe seen from above.
+    """The votes of one keyframe, on a lattice of cells whose cell (0, 0) has its centre at the origin of the plan.
 
     Attributes:
-        reach_m: (720,) farthest return of each bearing around the sensor, counter-clockwise from x; 0 without any.
-        walls_m: (n, 2) float32 returns near the height of the sensor.
+        open_cells, wall_cells: (n, 2) int32 row (along y) and column (along x); no cell is in both.
     """
 
-    reach_m: F64
-    walls_m: F32
+    open_cells: I32
+    wall_cells: I32
 
 
-def plan_view(cloud_level: F32, config: IntersectionsConfig) -> PlanView:
+def plan_view(cloud: F32, at_m: F64, config: IntersectionsConfig) -> PlanView:
     """What a keyframe shows of the plan.
 
     Args:
-        cloud_level: (n, 3) points around the sensor, levelled.
-        config: `range_m`, `wall_band_m`.
+        cloud: (n, 3) points around the sensor, levelled, in the axes of the plan.
+        at_m: (2,) where the sensor is in the plan.
+        config: `cell_m`, `range_m`, `wall_band_m`.
     """
-    return PlanView(*_view(np.ascontiguousarray(cloud_level), config.range_m, config.wall_band_m))
+    return PlanView(
+        *_view(
+            np.ascontiguousarray(cloud), float(at_m[0]), float(at_m[1]), config.cell_m, config.range_m,
+            config.wall_band_m,
+        )
+    )  # fmt: skip
 
 
-def free_grid(views: Sequence[PlanView], T_here_there: F64, config: IntersectionsConfig) -> FreeGrid:
-    """Lay keyframes over each other.
+def free_grid(views: Sequence[PlanView], at_m: F64, config: IntersectionsConfig) -> FreeGrid:
+    """Lay keyframes over each other: a square of the plan around a place, which is the origin of its frame.
 
     Args:
         views: of each keyframe.
-        T_here_there: (k, 4, 4) from each one's level frame to the one in whose middle the grid lies.
-        config: `cell_m`, `half_m`, `range_m`, `wall_votes`.
+        at_m: (2,) of the place in the plan.
+        config: `cell_m`, `half_m`, `wall_votes`.
     """
-    cells = 2 * round(config.half_m / config.cell_m) + 1
-    origin = -0.5 * (cells - 1) * config.cell_m
-    opened, closed, stamp = (np.zeros((cells, cells), np.int32) for _ in range(3))
-    for index, (view, T) in enumerate(zip(views, T_here_there, strict=True)):
-        _vote(
-            view.walls_m, view.reach_m, np.ascontiguousarray(T), origin, config.cell_m, config.range_m,
-            index + 1, stamp, opened, closed,
-        )  # fmt: skip
-    return FreeGrid(config.cell_m, np.array([origin, origin]), _sight(opened, closed, config.wall_votes))
+    half = round(config.half_m / config.cell_m)
+    middle = np.rint(at_m / config.cell_m).astype(np.int64)
+    first = middle[::-1] - half
+    opened, closed = np.zeros((2 * half + 1, 2 * half + 1), np.int32), np.zeros((2 * half + 1, 2 * half + 1), np.int32)
+    for view in views:
+        _add(view.open_cells, first, opened)
+        _add(view.wall_cells, first, closed)
+    origin = config.cell_m * (middle - half) - at_m
+    return FreeGrid(config.cell_m, origin, _sight(opened, closed, config.wall_votes))
 
 
 @njit(cache=True, nogil=True)
-def _view(points: F32, range_m: float, band_m: float) -> tuple[F64, F32]:
+def _view(points: F32, x_m: float, y_m: float, cell_m: float, range_m: float, band_m: float) -> tuple[I32, I32]:
+    """A cell counts once: as wall where a beam ends near the height of the sensor, else as open."""
     farthest = np.zeros(_BEAMS)
-    walls = np.empty((len(points), 2), np.float32)
-    count = 0
+    half = int(range_m / cell_m) + 2
+    n = 2 * half + 1
+    row0, column0 = int(np.rint(y_m / cell_m)) - half, int(np.rint(x_m / cell_m)) - half
+    stamp = np.zeros((n, n), np.uint8)
+    walls = np.empty((len(points), 2), np.int32)
+    wall_count = 0
     for i in range(len(points)):
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         r = np.sqrt(x * x + y * y)
@@ -102,41 +114,36 @@ def _view(points: F32, range_m: float, band_m: float) -> tuple[F64, F32]:
         beam = int((np.arctan2(y, x) / (2 * np.pi) + 1.0) * _BEAMS) % _BEAMS
         farthest[beam] = max(farthest[beam], r)
         if r <= range_m and abs(z) <= band_m:
-            walls[count, 0], walls[count, 1] = points[i, 0], points[i, 1]
-            count += 1
-    return farthest, walls[:count].copy()
-
-
-@njit(cache=True, nogil=True)
-def _vote(
-    walls: F32, farthest: F64, T: F64, origin: float, cell_m: float, range_m: float,
-    vote: int, stamp: I32, opened: I32, closed: I32,
-) -> None:  # fmt: skip
-    """One keyframe's votes: a cell counts once as wall, else once as open."""
-    n = len(opened)
-    sx, sy = T[0, 3], T[1, 3]
-    for i in range(len(walls)):
-        x, y = np.float64(walls[i, 0]), np.float64(walls[i, 1])
-        px, py = T[0, 0] * x + T[0, 1] * y + sx, T[1, 0] * x + T[1, 1] * y + sy
-        column, row = int(np.rint((px - origin) / cell_m)), int(np.rint((py - origin) / cell_m))
-        if 0 <= row < n and 0 <= column < n and stamp[row, column] != vote:
-            stamp[row, column] = vote
-            closed[row, column] += 1
+            row, column = int(np.rint((y_m + y) / cell_m)), int(np.rint((x_m + x) / cell_m))
+            if stamp[row - row0, column - column0] == 0:
+                stamp[row - row0, column - column0] = 1
+                walls[wall_count, 0], walls[wall_count, 1] = row, column
+                wall_count += 1
+    opened = np.empty((n * n, 2), np.int32)
+    open_count = 0
     for beam in range(_BEAMS):
         reach = min(farthest[beam] - _SHORT_M, range_m)
         if reach <= 0.0:
             continue
         angle = 2 * np.pi * (beam + 0.5) / _BEAMS
         dx, dy = np.cos(angle), np.sin(angle)
-        ux, uy = T[0, 0] * dx + T[0, 1] * dy, T[1, 0] * dx + T[1, 1] * dy
-        steps = int(reach / (0.7 * cell_m))
-        for k in range(steps + 1):
-            s = 0.7 * cell_m * k
-            column, row = int(np.rint((sx + s * ux - origin) / cell_m)), int(np.rint((sy + s * uy - origin) / cell_m))
-            # a cell of this keyframe's walls, or one already counted, carries its stamp
-            if 0 <= row < n and 0 <= column < n and stamp[row, column] != vote:
-                stamp[row, column] = vote
-                opened[row, column] += 1
+        for k in range(int(reach / (_STEP * cell_m)) + 1):
+            s = _STEP * cell_m * k
+            row, column = int(np.rint((y_m + s * dy) / cell_m)), int(np.rint((x_m + s * dx) / cell_m))
+            if stamp[row - row0, column - column0] == 0:
+                stamp[row - row0, column - column0] = 2
+                opened[open_count, 0], opened[open_count, 1] = row, column
+                open_count += 1
+    return opened[:open_count].copy(), walls[:wall_count].copy()
+
+
+@njit(cache=True, nogil=True)
+def _add(cells: I32, first: I64, votes: I32) -> None:
+    rows, columns = votes.shape
+    for i in range(len(cells)):
+        row, column = cells[i, 0] - first[0], cells[i, 1] - first[1]
+        if 0 <= row < rows and 0 <= column < columns:
+            votes[row, column] += 1
 
 
 def _sight(opened: I32, closed: I32, wall_votes: float) -> U8:
@@ -147,36 +154,25 @@ def _sight(opened: I32, closed: I32, wall_votes: float) -> U8:
     return sight
 
 
-def free_grid_plainly(clouds_level: Sequence[F32], T_here_there: F64, config: IntersectionsConfig) -> FreeGrid:
-    """`plan_view` and `free_grid` in plain numpy, of (n, 3) levelled points each: what the kernels are held to."""
-    cells = 2 * round(config.half_m / config.cell_m) + 1
-    origin = -0.5 * (cells - 1) * config.cell_m
-    opened, closed = np.zeros((cells, cells), np.int32), np.zeros((cells, cells), np.int32)
-    for cloud, T in zip(clouds_level, T_here_there, strict=True):
-        points = cloud.astype(np.float64)
-        r = np.hypot(points[:, 0], points[:, 1])
-        points, r = points[r >= 1e-6], r[r >= 1e-6]
-        level = points[:, :2] @ T[:2, :2].T
-        is_wall = (r <= config.range_m) & (np.abs(points[:, 2]) <= config.wall_band_m)
-        wall = _mask(level[is_wall] + T[:2, 3], origin, cells, config.cell_m)
-        farthest = np.zeros(_BEAMS)
-        beams = ((np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 1.0) * _BEAMS).astype(np.int64) % _BEAMS
-        np.maximum.at(farthest, beams, r)
-        crossed = np.zeros_like(wall)
-        for beam in np.flatnonzero(farthest > _SHORT_M):
-            angle = 2 * np.pi * (beam + 0.5) / _BEAMS
-            direction = T[:2, :2] @ np.array([np.cos(angle), np.sin(angle)])
-            reach = min(farthest[beam] - _SHORT_M, config.range_m)
-            s = 0.7 * config.cell_m * np.arange(int(reach / (0.7 * config.cell_m)) + 1)
-            crossed |= _mask(T[:2, 3] + s[:, None] * direction, origin, cells, config.cell_m)
-        closed += wall
-        opened += crossed & ~wall
-    return FreeGrid(config.cell_m, np.array([origin, origin]), _sight(opened, closed, config.wall_votes))
+def plan_view_plainly(cloud: F32, at_m: F64, config: IntersectionsConfig) -> PlanView:
+    """`plan_view` in plain numpy: what the kernel is held to; cells in another order."""
+    points = cloud.astype(np.float64)
+    r = np.hypot(points[:, 0], points[:, 1])
+    points, r = points[r >= 1e-6], r[r >= 1e-6]
+    is_wall = (r <= config.range_m) & (np.abs(points[:, 2]) <= config.wall_band_m)
+    walls = {*_cells(points[is_wall, :2] + at_m, config.cell_m)}
+    farthest = np.zeros(_BEAMS)
+    beams = ((np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 1.0) * _BEAMS).astype(np.int64) % _BEAMS
+    np.maximum.at(farthest, beams, r)
+    crossed: set[tuple[int, int]] = set()
+    for beam in np.flatnonzero(farthest > _SHORT_M):
+        angle = 2 * np.pi * (beam + 0.5) / _BEAMS
+        reach = min(farthest[beam] - _SHORT_M, config.range_m)
+        s = _STEP * config.cell_m * np.arange(int(reach / (_STEP * config.cell_m)) + 1)
+        crossed |= {*_cells(at_m + s[:, None] * np.array([np.cos(angle), np.sin(angle)]), config.cell_m)}
+    open_cells = sorted(crossed - walls)
+    return PlanView(np.array(open_cells, np.int32).reshape(-1, 2), np.array(sorted(walls), np.int32).reshape(-1, 2))
 
 
-def _mask(places: F64, origin: float, cells: int, cell_m: float) -> Bool:
-    cell = np.rint((places - origin) / cell_m).astype(np.int64)
-    cell = cell[((cell >= 0) & (cell < cells)).all(axis=1)]
-    out = np.zeros((cells, cells), np.bool_)
-    out[cell[:, 1], cell[:, 0]] = True
-    return out
+def _cells(places: F64, cell_m: float) -> list[tuple[int, int]]:
+    return [(row, column) for column, row in np.rint(places / cell_m).astype(np.int64).tolist()]

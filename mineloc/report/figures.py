@@ -11,6 +11,7 @@ from mineloc.data import F64
 from mineloc.report.along import Band, Curve, curves
 from mineloc.report.density import density
 from mineloc.report.facts import RunFacts
+from mineloc.report.marks import marks_of
 from mineloc.report.plan import Colored, long_section, plan_view
 from mineloc.stages.comparison import frame_of
 
@@ -50,6 +51,7 @@ def run_figures(facts: RunFacts, key: str, *, detail: float = 1.0) -> RunFigures
             reference=reference,
             estimate=estimate,
             colored=_colored(facts),
+            marks=marks_of(facts, T_frame_map),
             detail=detail,
         ),
         section=_section(facts, f"{key}-section", estimate[:, 2], detail),

@@ -122,10 +122,10 @@ def _coordinates(values: Mapping[str, Any]) -> str:
     known = values["map"]
     if not known or not known["found"] or not known["is_grid"]:
         return "Coordinates are local metres; no mine grid or height datum is implied."
-    x, y, z = known["grid_origin_m"]
+    x, y, z = (f"{value:.3f}".rstrip("0").rstrip(".") for value in known["grid_origin_m"])
     return (
-        f"Coordinates of the figures are the map's: the mine grid less x {x:.0f} m, y {y:.0f} m, z {z:.0f} m. Those of "
-        "the table of recognitions are in the mine grid."
+        f"Coordinates of the figures are the map's: the mine grid less x {x} m, y {y} m, z {z} m. Those of the table "
+        "of recognitions are in the mine grid."
     )
 
 

@@ -44,6 +44,8 @@ def grouped(value: float, decimals: int) -> str:
 WRITTEN: Mapping[str, Callable[[float], str]] = {
     "m": metres,
     "m0": lambda value: grouped(value, 0),
+    "m1": lambda value: grouped(value, 1),
+    "ratio": lambda value: grouped(value, 2),
     "deg": lambda value: grouped(value, 2),
     "percent": three_digits,
     "number": three_digits,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ SCHEMA = "mineloc.report/1"
 MAX_BYTES = 1_000_000
 _DETAILS = (1.0, 0.8, 0.6, 0.45, 0.35, 0.25, 0.15, 0.1)
 _ROWS = 15
+_PLACES, _FEWEST_PLACES = 60, 10
 _ALIGNED = {"none": "nothing aligned", "origin": "first pose laid on first pose", "se3": "fitted as a whole"}
 
 
@@ -129,11 +131,12 @@ def _rendered(document: Mapping[str, Any], figures: Sequence[RunFigures], method
         document=document,
         number=Numbers(document),
         longest=_longest,
+        shown_places=partial(_shown_places, most=max(_PLACES // len(figures), _FEWEST_PLACES)),
         rep_count=max(len(run["accuracy"]["smoothed"]["rep"]) if run["accuracy"] else 0 for run in document["runs"]),
         aligned=_ALIGNED,
         sidecar=sidecar,
         style=Markup(style),
-        # drawn by us; names from outside never get into a figure
+        # drawn by us; the only names from outside, those of intersections, are escaped there
         figures=[{name: svg and Markup(svg) for name, svg in _named(one)} for one in figures],
         methods_figure=methods and Markup(methods),
     )
@@ -147,3 +150,10 @@ def _longest(stretches: Sequence[Mapping[str, Any]]) -> list[int]:
     """Indices of the longest in time, in the order of flight."""
     by_length = sorted(range(len(stretches)), key=lambda k: (-stretches[k]["duration_s"], k))
     return sorted(by_length[:_ROWS])
+
+
+def _shown_places(places: Sequence[Mapping[str, Any]], *, most: int) -> list[int]:
+    """Indices of what is worth a row first: wrong, missed, then recognised; in the order of flight."""
+    urgency = {"wrong": 0, "missed": 1, "recognised": 2, "refused": 3}
+    ranked = sorted(range(len(places)), key=lambda k: (urgency[places[k]["outcome"]], k))
+    return sorted(ranked[:most])

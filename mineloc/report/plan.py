@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from matplotlib.path import Path
 from mineloc.data import F64, I64, Bool
 from mineloc.report.along import Band, shade
 from mineloc.report.density import Density
+from mineloc.report.marks import Mark, paint_marks, shown_name
 from mineloc.report.svg import BLACK, BLUE, COLUMNS, WIDTH_IN, draw, error_colors, keep_peaks
 
 _MAX_VERTICES = 2000
@@ -44,6 +46,7 @@ def plan_view(
     reference: F64 | None,
     estimate: F64,
     colored: Colored | None,
+    marks: Sequence[Mark] = (),
     detail: float = 1.0,
 ) -> str:
     """SVG of the flight over the mine, equal aspect.
@@ -54,6 +57,7 @@ def plan_view(
         reference: (n, 3) positions, drawn thin and black.
         estimate: (m, 3) positions.
         colored: what colours the estimate; None for one colour.
+        marks: intersections.
         detail: as of `density`.
     """
     x0, x1, y0, y1 = _bounds(background, reference, estimate)
@@ -80,9 +84,12 @@ def plan_view(
         axes.set_xlabel("x (m)")
         axes.set_ylabel("y (m)")
         _paint_scale(axes, x1 - x0)
+        paint_marks(figure, axes, marks)
         axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, borderaxespad=0.2)
 
-    return draw(key, (WIDTH_IN, height), paint, alt="Plan view: the estimated trajectory over the points of the mine")
+    alt = "Plan view: the estimated trajectory over the points of the mine"
+    names = [shown_name(one.name) for one in marks]
+    return draw(key, (WIDTH_IN, height), paint, alt=alt, names=names)
 
 
 def long_section(

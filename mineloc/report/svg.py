@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from markupsafe import escape
 from matplotlib.colors import Colormap, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.typing import RcKeyType
@@ -64,10 +65,19 @@ _AROUND_COMMAND = re.compile(r"\s*([MLCQZz])\s*")
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 _BETWEEN_TAGS = re.compile(r">\s+<")
 _MARKER = 400
+_NAME = re.compile(r'style="([^"]*)"([^>]*)>@name(\d+)@<')
+_HALO = "paint-order:stroke;stroke:#fff;stroke-width:1.6px;stroke-linejoin:round;"
 _IDENTIFIER = re.compile(r'(\bid="|url\(#|href="#)')
 
 
-def draw(key: str, size_in: tuple[float, float], paint: Callable[[Figure], None], *, alt: str) -> str:
+def name_token(number: int) -> str:
+    """What stands in a figure for a name from outside until `draw` has made an SVG of it."""
+    return f"@name{number}@"
+
+
+def draw(
+    key: str, size_in: tuple[float, float], paint: Callable[[Figure], None], *, alt: str, names: Sequence[str] = ()
+) -> str:
     """An inline `<svg>` element.
 
     Args:
@@ -75,6 +85,7 @@ def draw(key: str, size_in: tuple[float, float], paint: Callable[[Figure], None]
         size_in: width and height.
         paint: draws into the figure.
         alt: what the figure shows, for those who cannot see it; plain text without user input.
+        names: from outside, put in place of their `name_token`, escaped: neither our patterns nor the fonts see them.
     """
     buffer = io.StringIO()
     with mpl.rc_context():
@@ -89,6 +100,9 @@ def draw(key: str, size_in: tuple[float, float], paint: Callable[[Figure], None]
     # the page's style gives the size, the viewBox the shape
     head, rest = svg.split(">", 1)
     head = re.sub(r'\s(width|height)="[^"]*"', "", head)
+    rest = _NAME.sub(
+        lambda text: f'style="{_HALO}{text[1]}"{text[2]}>{escape(names[int(text[3])])}<', rest
+    )  # readable over lines
     return f'{head} role="img" aria-label="{alt}">{rest}'.strip()
 
 

@@ -69,8 +69,8 @@ def frame_of(comparison: Comparison | None) -> F64:
 def _shown_alignment(run: RunFolder, config: EvaluateConfig) -> Alignment:
     """In a map that stands in the mine grid nothing is aligned: estimate and reference are told in its frame.
 
-    Else the first pose is laid on the reference's: the error begins at zero and grows as the drift does. So it is too
-    for a flight that did not find itself in the map, and in a map without a grid, whose frame is that of another flight.
+    Else the first pose is laid on the reference's: the error begins at zero and grows as the drift does. So it is for
+    a flight that did not find itself in the map, and in a map without a grid, whose frame is that of another flight.
     """
     if config.shown_alignment != "auto":
         return config.shown_alignment

@@ -206,7 +206,7 @@ def _run_steps(flight: Flight, method: str, to: str, known: Map | None) -> Itera
     yield Step(
         f"{flight.name} evaluate {method}", flight.name, EVALUATE, f"{to}/{METRICS}", run | reference, flight.config
     )
-    seen = run | {"flight": Made(f"{flight.name} ingest")}
+    seen = run | {name: inputs[name] for name in ("flight", "database") if name in inputs}
     yield Step(f"{flight.name} record {method}", flight.name, RECORD, f"{to}/{RECORDING}", seen, flight.config)
 
 

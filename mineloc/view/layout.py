@@ -21,7 +21,14 @@ _CURVES = (
 
 
 def flight_layout(
-    low_m: F64, high_m: F64, *, first_ns: int, last_ns: int, curves: Mapping[str, tuple[float, float]], log: bool
+    low_m: F64,
+    high_m: F64,
+    *,
+    first_ns: int,
+    last_ns: int,
+    curves: Mapping[str, tuple[float, float]],
+    log: bool,
+    recognitions: bool = False,
 ) -> rrb.Blueprint:
     """The layout of a run or a flight.
 
@@ -30,6 +37,7 @@ def flight_layout(
         first_ns, last_ns: all curves open on this span of time.
         curves: groups of curves below `/curves` that the recording has, with their lowest and highest value.
         log: whether it has decisions and states.
+        recognitions: whether it has recognised intersections: they get a tab of their own.
     """
     span = rrb.TimeRange(
         start=rrb.TimeRangeBoundary.absolute(nanos=first_ns),
@@ -53,16 +61,40 @@ def flight_layout(
         lanes.append(rrb.StateTimelineView(origin="states", name="States", time_view=axis))
         seen = rrb.Horizontal(mine, rrb.Vertical(*lanes), column_shares=[3, 2])
         root = rrb.Vertical(
-            seen, rrb.Horizontal(rrb.TextLogView(origin="log", name="Decisions"), about), row_shares=[3, 1]
+            seen,
+            rrb.Horizontal(rrb.TextLogView(origin="log", name="Decisions"), about),
+            row_shares=[3, 1],
+            name="Flight",
         )
     else:
         root = rrb.Horizontal(mine, rrb.Vertical(*lanes, about), column_shares=[3, 2])
+    if recognitions:
+        root = rrb.Tabs(root, _recognitions(), active_tab=0)
     return rrb.Blueprint(
         root,
         rrb.TimePanel(timeline=TIMELINE, state=rrb.PanelState.Collapsed),
         rrb.SelectionPanel(state=rrb.PanelState.Hidden),
         rrb.BlueprintPanel(state=rrb.PanelState.Collapsed),
         auto_views=False,
+    )
+
+
+def _recognitions() -> rrb.Container:
+    """One recognition at a time, that of the time cursor; a line of the list takes the cursor to another."""
+    eye = rrb.EyeControls3D(position=(0.0, -9.0, 17.0), look_target=(0.0, -0.5, 0.5), eye_up=(0.0, 0.0, 1.0))
+    clouds = rrb.Spatial3DView(origin="recognised", name="Stored and seen", eye_controls=eye, line_grid=False)
+    contours = rrb.Spatial2DView(
+        origin="contours",
+        name="Contours (PWCV)",
+        visual_bounds=rrb.VisualBounds2D(x_range=[-9.0, 9.0], y_range=[-9.0, 9.0]),
+    )
+    listed = rrb.TextLogView(origin="recognitions/list", name="Recognised, by time: click one")
+    steps = rrb.TextDocumentView(origin="recognitions/steps", name="Why it was accepted")
+    return rrb.Horizontal(
+        rrb.Vertical(clouds, listed, row_shares=[3, 1]),
+        rrb.Vertical(contours, steps, row_shares=[2, 3]),
+        column_shares=[3, 2],
+        name="Recognitions",
     )
 
 

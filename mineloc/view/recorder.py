@@ -33,6 +33,8 @@ SKY: Rgb = (86, 180, 233)
 GREEN: Rgb = (0, 158, 115)
 YELLOW: Rgb = (240, 228, 66)
 VERMILION: Rgb = (213, 94, 0)
+_DIM: Rgb = (90, 90, 90)
+_PLAN_LINE = rr.Radius.ui_points(1.5)
 
 
 class RunRecorder:
@@ -64,6 +66,11 @@ class RunRecorder:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stream.disconnect()
+
+    @staticmethod
+    def path(*parts: str) -> str:
+        """An entity of parts that may hold any letter: names from outside."""
+        return rr.new_entity_path(list(parts))
 
     def cloud(self, entity: str, points_map: F64 | F32, *, colors: NDArray[np.uint8] | Rgb, radius_m: float) -> None:
         """A cloud that is always there: (n, 3) map points, one colour or (n, 3) colours."""
@@ -145,11 +152,53 @@ class RunRecorder:
         """A page of text that is always there."""
         self._stream.log(entity, rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN), static=True)
 
+    def documents(self, entity: str, pages: Sequence[tuple[int, str]]) -> None:
+        """Pages of text over time, (time, markdown), each shown until the next."""
+        if pages:
+            stamps, texts = zip(*pages, strict=True)
+            kinds = [rr.MediaType.MARKDOWN] * len(texts)
+            columns = rr.TextDocument.columns(text=list(texts), media_type=kinds)
+            self._stream.send_columns(entity, [_times(np.array(stamps, dtype=np.int64))], columns)
+
+    def cloud_during(
+        self, entity: str, span_ns: tuple[int, int | None], points_m: F64, *, color: Rgb, radius_m: float
+    ) -> None:
+        """(n, 3) points in a frame of their own, not moved to the local origin; gone at the end of the span."""
+        self._stream.log(entity, rr.Points3D.from_fields(colors=color, radii=radius_m), static=True)
+        columns = rr.Points3D.columns(positions=np.round(points_m, _DECIMALS).astype(np.float32))
+        self._during(entity, span_ns, columns, len(points_m))
+
+    def plan_during(self, entity: str, span_ns: tuple[int, int | None], strips_m: Sequence[F64], *, color: Rgb) -> None:
+        """Polylines over ground, each (n, 2), x to the right and y up; gone at the end of the span."""
+        self._stream.log(entity, rr.LineStrips2D.from_fields(colors=color, radii=_PLAN_LINE), static=True)
+        if strips_m:
+            columns = rr.LineStrips2D.columns(strips=[_upright(strip) for strip in strips_m])
+            self._during(entity, span_ns, columns, len(strips_m))
+
+    def circles(self, entity: str, radii_m: Sequence[float]) -> None:
+        """Circles over ground around zero, always there, with their radii."""
+        bearing = np.linspace(0.0, 2 * np.pi, 91)
+        rings = [r * np.column_stack([np.cos(bearing), np.sin(bearing)]) for r in radii_m]
+        texts = [f"{r:g} m" for r in radii_m]
+        picture = rr.LineStrips2D(rings, colors=np.asarray(_DIM), radii=rr.Radius.ui_points(0.5), labels=texts)
+        self._stream.log(entity, picture, static=True)
+
+    def _during(self, entity: str, span_ns: tuple[int, int | None], columns: rr.ComponentColumnList, n: int) -> None:
+        begin, end = span_ns
+        # an empty picture ends it: a `Clear` would be written with the time of writing
+        stamps, lengths = ([begin], [n]) if end is None else ([begin, end], [n, 0])
+        self._stream.send_columns(entity, [_times(np.array(stamps, dtype=np.int64))], columns.partition(lengths))
+
     def _local(self, points_map: F64 | F32) -> F32:
         return (np.asarray(points_map, dtype=np.float64) - self._origin).astype(np.float32)
 
     def _rounded(self, points_map: F64 | F32) -> F32:
         return np.round(np.asarray(points_map, dtype=np.float64) - self._origin, _DECIMALS).astype(np.float32)
+
+
+def _upright(strip_m: F64) -> F32:
+    # pictures count y downwards
+    return np.round(strip_m * np.array([1.0, -1.0]), _DECIMALS).astype(np.float32)
 
 
 def _times(stamps_ns: I64) -> rr.TimeColumn:

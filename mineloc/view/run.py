@@ -20,7 +20,9 @@ from mineloc.view import placed
 from mineloc.view.about import about_run
 from mineloc.view.curves import ranges, run_curves
 from mineloc.view.decisions import DEGENERATE, HELD, UNTRUSTED, run_decisions, run_states
+from mineloc.view.evidence import recognised
 from mineloc.view.layout import flight_layout
+from mineloc.view.recognitions import read_known, record_recognitions
 from mineloc.view.recorder import GREEN, ORANGE, SKY, VERMILION, WHITE, YELLOW, Rgb, RunRecorder
 from mineloc.view.scene import Scene
 
@@ -33,6 +35,7 @@ def record_run(
     out: Path,
     *,
     flight: Path | None = None,
+    database: Path | None = None,
     config: Config,
     overwrite: bool = False,
     progress: Progress = quiet,
@@ -43,16 +46,18 @@ def record_run(
         run: folder of `localize`.
         out: `.rrd` to write.
         flight: the flight of the run: its sweeps are shown; without it the keyframes' points are.
+        database: of intersections, that the run was localized with: what it recognised is shown beside what it knew.
         config: sections `view` and `evaluate`.
         overwrite: replace `out`.
         progress: told the sweeps that are done.
 
     Raises:
-        FormatError: not a run folder, or a flight of another time.
+        FormatError: not a run folder, a flight of another time, or not the database of the run.
         IngestError: not a canonical flight, or damaged.
         OutputError: `out` exists or cannot be written.
     """
     scene = Scene.of(RunFolder.open(run), config.evaluate)
+    places = [] if database is None else recognised(scene.run, read_known(database, scene.run))
     clouds = placed.keyframe_clouds(scene.run, scene.T_frame_map)
     origin = placed.local_origin(scene.smoothed.positions_m)
     mine = placed.mine_cloud(clouds, config.view, origin)
@@ -65,6 +70,7 @@ def record_run(
         last_ns=int(scene.smoothed.stamps_ns[-1]),
         curves=ranges(curves),
         log=True,
+        recognitions=bool(places),
     )
     with (
         new_file(out, overwrite=overwrite) as temp,
@@ -79,6 +85,8 @@ def record_run(
         for curve in curves:
             r.curve(curve.entity, curve.stamps_ns, curve.values, name=curve.name, color=curve.color)
         r.decisions("log", run_decisions(scene.run, scene.smoothed))
+        if places:
+            record_recognitions(r, places)
         r.states("states/registration", run_states(scene.run.sweeps), colors=_STATES)
         if flight is None or len(scene.lidar) < 2:
             shown = iter(placed.thinned(clouds, config.view))

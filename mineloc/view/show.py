@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ def show(
     what: Path,
     *,
     flight: Path | None = None,
+    database: Path | None = None,
     save: Path | None = None,
     picture: Path | None = None,
     overwrite: bool = False,
@@ -37,6 +39,7 @@ def show(
         what: a run folder, a map folder, a canonical flight or a database of intersections (.mcap), or a recording
             (.rrd).
         flight: the flight of a run, for its sweeps.
+        database: of intersections, of a run, for what it recognised.
         save: where to keep the recording.
         picture: where to write a picture of it, half way through the flight.
         overwrite: replace `save` and `picture`.
@@ -51,7 +54,9 @@ def show(
         MinelocError: what recording and viewer say.
     """
     with tempfile.TemporaryDirectory() as folder:
-        recording = _recording(what, flight, save or Path(folder) / "view.rrd", overwrite, config, progress)
+        out = save or Path(folder) / "view.rrd"
+        beside = {"flight": flight, "database": database}
+        recording = _recording(what, out, beside, overwrite=overwrite, config=config, progress=progress)
         if picture is not None:
             screenshot(recording, picture, at_ns=_middle_ns(recording), overwrite=overwrite)
         if save is None and picture is None:
@@ -59,15 +64,20 @@ def show(
     return [path for path in (save, picture) if path is not None]
 
 
-def _recording(what: Path, flight: Path | None, out: Path, overwrite: bool, config: Config, progress: Progress) -> Path:
-    if what.is_dir() and MapFolder.is_map(what):
-        return record_map(what, out, config=config.view, overwrite=overwrite)
-    if what.is_dir():
-        return record_run(what, out, flight=flight, config=config, overwrite=overwrite, progress=progress)
+def _recording(
+    what: Path, out: Path, beside: Mapping[str, Path | None], *, overwrite: bool, config: Config, progress: Progress
+) -> Path:
+    if what.is_dir() and not MapFolder.is_map(what):
+        return record_run(what, out, **beside, config=config, overwrite=overwrite, progress=progress)
     if not what.exists():
         raise FormatError(what, "no such file or folder", todo="check the path")
-    if flight is not None:
-        raise FormatError(what, "is no run folder", expected="a run folder with --flight", todo="leave out --flight")
+    for name, path in beside.items():
+        if path is not None:
+            raise FormatError(
+                what, "is no run folder", expected=f"a run folder with --{name}", todo=f"leave out --{name}"
+            )
+    if what.is_dir():
+        return record_map(what, out, config=config.view, overwrite=overwrite)
     if what.suffix == ".mcap" and is_database(what):
         return record_database(what, out, config=config.view, overwrite=overwrite)
     if what.suffix == ".mcap":

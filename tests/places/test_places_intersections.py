@@ -12,10 +12,19 @@ from scipy.ndimage import uniform_filter
 from mineloc import se3
 from mineloc.config import IntersectionsConfig
 from mineloc.data import F64, Sight, WallContour
-from mineloc.places.branches import Branch, Junction, find_junctions, invariant_point, ring, ring_plainly
+from mineloc.places.branches import (
+    Branch,
+    Junction,
+    find_junctions,
+    invariant_point,
+    ring,
+    ring_plainly,
+    runs_on,
+    runs_plainly,
+)
 from mineloc.places.clearance import clearance_of, clearance_plainly
 from mineloc.places.contour_matrix import contour_matrix, matrix_likeness
-from mineloc.places.free_grid import FreeGrid, free_grid, free_grid_plainly, plan_view
+from mineloc.places.free_grid import FreeGrid, PlanView, free_grid, plan_view, plan_view_plainly
 from mineloc.places.wall_contour import (
     branches_fit,
     contour_likeness,
@@ -45,8 +54,8 @@ def at(x_m: float, y_m: float, yaw_deg: float = 0.0) -> F64:
 def flown_grid(plan: Plan, way: list[F64], seed: int = 0) -> FreeGrid:
     """Free space as known at the last of some poses of a flight."""
     rng = np.random.default_rng(seed)
-    sweeps = [plan.sweep(T[:2, 3], float(np.arctan2(T[1, 0], T[0, 0])), rng) for T in way]
-    return free_grid([plan_view(one, CONFIG) for one in sweeps], se3.inverse(way[-1]) @ np.array(way), CONFIG)
+    views = [plan_view(plan.sweep(T[:2, 3], 0.0, rng), T[:2, 3], CONFIG) for T in way]
+    return free_grid(views, way[-1][:2, 3], CONFIG)
 
 
 def along_x(start_m: float, end_m: float) -> list[F64]:
@@ -58,16 +67,44 @@ def seen(plan: Plan, way: list[F64], seed: int = 0) -> list[Junction]:
 
 
 @settings(deadline=None, max_examples=15)
-@given(seed=st.integers(0, 10_000), keyframes=st.integers(1, 4), half_m=st.sampled_from([4.0, 8.0]))
-def test_the_kernel_votes_as_plain_numpy_does(seed: int, keyframes: int, half_m: float) -> None:
+@given(seed=st.integers(0, 10_000), x=st.floats(-500, 500), y=st.floats(-500, 500))
+def test_the_kernel_votes_as_plain_numpy_does(seed: int, x: float, y: float) -> None:
     rng = np.random.default_rng(seed)
-    config = CONFIG.model_copy(update={"half_m": half_m, "range_m": 6.0})
-    clouds = [rng.normal(0, 3, (int(rng.integers(0, 200)), 3)).astype(np.float32) for _ in range(keyframes)]
-    poses = np.array([at(*rng.normal(0, 2, 2), float(rng.uniform(-180, 180))) for _ in range(keyframes)])
-    views = [plan_view(cloud, config) for cloud in clouds]
-    fast, plain = free_grid(views, poses, config), free_grid_plainly(clouds, poses, config)
-    # a place on the line between two cells may round either way
-    assert (fast.sight != plain.sight).mean() < 0.002
+    config = CONFIG.model_copy(update={"range_m": 6.0})
+    cloud = rng.normal(0, 3, (int(rng.integers(0, 200)), 3)).astype(np.float32)
+    fast, plain = (make(cloud, np.array([x, y]), config) for make in (plan_view, plan_view_plainly))
+    for cells, others in ((fast.open_cells, plain.open_cells), (fast.wall_cells, plain.wall_cells)):
+        # a place on the line between two cells may round either way
+        assert len({*map(tuple, cells.tolist())} ^ {*map(tuple, others.tolist())}) <= 2
+        assert len({*map(tuple, cells.tolist())}) == len(cells)
+
+
+def test_most_keyframes_decide_what_a_cell_is() -> None:
+    def cells(*places: tuple[int, int]) -> np.ndarray:
+        return np.array(places, np.int32).reshape(-1, 2)
+
+    config = CONFIG.model_copy(update={"half_m": 1.0})
+    views = [
+        PlanView(cells((0, 0), (0, 1), (2, 3)), cells((0, 2))),
+        PlanView(cells((0, 0), (0, 2), (900, 0)), cells((0, 1))),
+        PlanView(cells((0, 2)), cells((0, 1))),
+    ]
+    grid = free_grid(views, np.array([0.03, -0.02]), config)
+    assert grid.sight.shape == (11, 11)
+    assert grid.origin_m == pytest.approx([-1.03, -0.98])
+    row, column = grid.cells_of(np.array([[-0.03, 0.02], [0.17, 0.02], [0.37, 0.02], [0.57, 0.42]]))
+    assert grid.sight[row, column].tolist() == [Sight.OPEN, Sight.WALL, Sight.OPEN, Sight.OPEN]
+    assert (grid.sight != Sight.UNKNOWN).sum() == 4
+
+
+@settings(deadline=None, max_examples=80)
+@given(filled=st.lists(st.booleans(), min_size=4, max_size=40), gap=st.integers(0, 3))
+def test_runs_on_a_ring_are_those_of_numpy(filled: list[bool], gap: int) -> None:
+    def covered(runs: np.ndarray) -> set[tuple[int, int]]:
+        return {(first % len(filled), end - first) for first, end in runs.tolist()}
+
+    ring_of = np.array(filled)
+    assert covered(runs_on(ring_of, gap)) == covered(runs_plainly(ring_of, gap))
 
 
 @settings(deadline=None, max_examples=60)
@@ -105,7 +142,7 @@ def test_an_intersection_flown_through_has_its_branches_and_its_point(shape: str
     for seed, end_m in enumerate((-1.0, 0.0, 1.0, 2.0, 3.0)):
         way = way_through(shape, -8.0, end_m)
         assert plan.is_open(np.array([T[:2, 3] for T in way])).all()
-        places = [(one, se3.apply(way[-1], [[*one.point_m, 0.0]])[0, :2]) for one in seen(plan, way, seed)]
+        places = [(one, one.point_m + way[-1][:2, 3]) for one in seen(plan, way, seed)]
         near = [(one, place) for one, place in places if np.linalg.norm(place) < 2.5]
         none += not near
         points += [place for _, place in near[:1]]
