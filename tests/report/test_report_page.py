@@ -4,11 +4,11 @@ import base64
 import json
 import re
 import shutil
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
+from report_page import Page
 from synthetic_run import SyntheticRun, write_synthetic_run
 from typer.testing import CliRunner
 
@@ -25,53 +25,6 @@ from mineloc.report.page import MAX_BYTES, letter_of, write_report
 from mineloc.stages.run_folder import RunFolder
 
 NASTY = 'Ψ "7" <script>alert(1)</script> & $x^2$ {{ 7*7 }} пещера 矿井 \u202e'
-VOID = {"meta", "br", "img", "hr", "input", "link", "col"}
-
-
-class Page(HTMLParser):
-    """A page as its elements: checks that tags close in order, keeps attributes, text and `<data>`."""
-
-    def __init__(self, html: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.tags: list[str] = []
-        self.attributes: list[tuple[str, str, str]] = []
-        self.texts: list[str] = []
-        self.data: list[tuple[dict[str, str], str]] = []
-        self._in_data: dict[str, str] | None = None
-        self.feed(html)
-        self.close()
-        assert self.open == []
-
-    def handle_starttag(self, tag, attrs):
-        self._element(tag, attrs)
-        if tag not in VOID:
-            self.open.append(tag)
-        if tag == "data":
-            self._in_data = dict(attrs)
-
-    def handle_startendtag(self, tag, attrs):
-        self._element(tag, attrs)
-
-    def _element(self, tag, attrs):
-        self.tags.append(tag)
-        self.attributes += [(tag, name, value or "") for name, value in attrs]
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-        if tag == "data":
-            self._in_data = None
-
-    def handle_data(self, data):
-        if self.open and self.open[-1] == "style":
-            return
-        self.texts.append(data)
-        if self._in_data is not None:
-            self.data.append((self._in_data, data))
-
-    @property
-    def text(self) -> str:
-        return " ".join("".join(self.texts).split())
 
 
 def _report(
@@ -192,7 +145,9 @@ def test_stretches_and_recognitions_are_told(two):
     assert registration["degenerate_share"] == pytest.approx(4 * 109 / 3000)
     assert "inlier ratio 0.08 < 0.2" in page.text
     recognitions = document["runs"][0]["recognitions"]
-    assert recognitions["reasons"] == [{"reason": "overlap 0.31 < 0.6", "count": recognitions["refused"]}]
+    (stopped,) = recognitions["stopped"]
+    assert (stopped["reason"], stopped["count"]) == ("overlap 0.31 < 0.6", recognitions["refused"])
+    assert recognitions["places"] is None
     assert recognitions["accepted"] == 11
 
 
