@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -42,10 +43,10 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def simulated(out: Path, mesh: Path, length_m: float, seed: int, options: dict[str, float]) -> Path:
+def simulated(out: Path, mesh: Path | str, length_m: float, seed: int, options: Mapping[str, float | str]) -> Path:
     """A flight through the mesh, in a grid that is neither the mesh's frame nor small."""
     if not out.exists():
-        sets = [word for key, value in (GRID | options).items() for word in ("--set", f"simulate.{key}={value}")]
+        sets = [word for key, value in {**GRID, **options}.items() for word in ("--set", f"simulate.{key}={value}")]
         mineloc("simulate", mesh, "--out", out, "--length-m", str(length_m), "--seed", str(seed), *sets)
     return out
 

@@ -9,6 +9,7 @@ from rich.table import Table
 from mineloc.metrics.statistics import Statistics
 from mineloc.stages.before_after import BeforeAfter
 from mineloc.stages.evaluate import Evaluation
+from mineloc.stages.recognitions import Recognition
 from mineloc.stages.scores import Scores
 
 _NOTHING = "-"
@@ -62,7 +63,18 @@ def _facts(evaluation: Evaluation, prefix: str) -> Iterator[str]:
     for scores in evaluation.scores:
         yield f"{prefix}{scores.name}: {_pairing(scores)}; {_covered(scores)}"
         yield from (f"{prefix}{scores.name}: {note}" for note in scores.notes)
+    if evaluation.recognition is not None:
+        yield f"{prefix}{_recognition(evaluation.recognition)}"
     yield from evaluation.notes
+
+
+def _recognition(found: Recognition) -> str:
+    score = found.score
+    wrong = f"{score.wrong} of {score.accepted} recognitions wrong"
+    if found.recall is None:
+        return f"recognition: {wrong}, no intersection was passed"
+    first = "" if score.first_m is None else f", the first after {score.first_m:.0f} m"
+    return f"recognition: {found.recall:.1%} of the passages of intersections, {wrong}{first}"
 
 
 def tables(evaluation: Evaluation) -> list[Table]:
