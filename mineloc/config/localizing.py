@@ -31,6 +31,9 @@ class PriorMapConfig(Section):
     max_moved_sigmas: float = Field(default=4.0, gt=0, description="away from where odometry expects it")
     moved_floor_m: float = Field(default=0.15, gt=0)
     moved_floor_deg: float = Field(default=0.5, gt=0)
+    lost_after: int = Field(
+        default=50, ge=1, description="keyframes that do not fit the map; then intersections find the flight anew"
+    )
     seen_floor_m: float = Field(default=1.0, gt=0, description="added to the prediction before registration")
     seen_floor_deg: float = Field(default=5.0, gt=0, description="added to the prediction before registration")
     correlation: float = Field(default=20.0, ge=1, description="so many residuals share one error")

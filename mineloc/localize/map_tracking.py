@@ -22,7 +22,7 @@ from mineloc.localize.map_tracker import IntersectionTracker, MapTracker, Tracke
 from mineloc.localize.pose_filter import PoseFilter
 from mineloc.localize.prior_map import PriorMap
 from mineloc.localize.recognition import Recognizer
-from mineloc.localize.relocalization import Relocalizer
+from mineloc.localize.relocalization import RecoveringTracker, Relocalizer
 from mineloc.localize.sequence import RoadwaySequence
 from mineloc.odometry.front_end import FrontEnd
 from mineloc.progress import Progress
@@ -104,12 +104,20 @@ class Prior:
         return Relocalizer(Recognizer(config, self.database), config, lambda known: self._track(config, known, by))
 
     def _track(self, config: Config, known: PoseFilter, by: By) -> Tracker:
+        database = self.database
         if by == "map":
             assert self.map is not None
-            return MapTracker(self.map, config, known)
-        assert self.database is not None
-        sequence = RoadwaySequence(self.database, config.intersections)
-        return IntersectionTracker(Recognizer(config, self.database), sequence, config, known)
+            tracker = MapTracker(self.map, config, known)
+            if database is None:
+                return tracker
+            return RecoveringTracker(
+                tracker,
+                lambda: Relocalizer(Recognizer(config, database), config, lambda found: self._track(config, found, by)),
+                after=config.prior_map.lost_after,
+            )
+        assert database is not None
+        sequence = RoadwaySequence(database, config.intersections)
+        return IntersectionTracker(Recognizer(config, database), sequence, config, known)
 
 
 class MapTracking:

@@ -118,3 +118,46 @@ class Relocalizer:
         most = max((len(one.seen) for one in self._hypotheses), default=0)
         needed = self._config.intersections.found_needed
         return f"{count} places are possible, the likeliest with {most} of {needed} intersections (not found yet)"
+
+
+class RecoveringTracker:
+    """A tracker that is searched for anew when it has long been refused: the map changed, or the pose is wrong.
+
+    Args:
+        tracker: follows the flight.
+        search: makes a `Relocalizer` of the same mine.
+        after: keyframes in a row without a trusted fix.
+    """
+
+    def __init__(self, tracker: Tracker, search: Callable[[], Relocalizer], *, after: int) -> None:
+        self._tracker, self._make, self._after = tracker, search, after
+        self._search: Relocalizer | None = None
+        self._before: list[Fix] = []
+        self._refused = 0
+
+    @property
+    def filter(self) -> PoseFilter | None:
+        """As `Tracker.filter`; while the flight is searched for, what the tracker believed goes on."""
+        return self._tracker.filter
+
+    @property
+    def fixes(self) -> list[Fix]:
+        """As `Tracker.fixes`."""
+        return [*self._before, *self._tracker.fixes]
+
+    def follow(self, keyframe: Keyframe, edge: RelativePose | None) -> None:
+        """As `Tracker.follow`."""
+        self._tracker.follow(keyframe, edge)
+        self._refused = 0 if self._tracker.fixes[-1].trusted else self._refused + 1
+        if self._refused < self._after:
+            self._search = None
+            return
+        if self._search is None:
+            self._search, edge = self._make(), None
+        self._search.follow(keyframe, edge)
+        if self._search.filter is None:
+            return
+        # from here on the search is what follows the flight; what the tracker said meanwhile was refused
+        own = self._search.fixes
+        self._before = [*self._before, *self._tracker.fixes[: len(self._tracker.fixes) - len(own)]]
+        self._tracker, self._search, self._refused = self._search, None, 0

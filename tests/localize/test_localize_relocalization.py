@@ -9,11 +9,11 @@ from plan_scenes import Plan, TwoIntersections, edges_of, flown
 
 from mineloc import se3
 from mineloc.config import Config
-from mineloc.data import F64, Fix, IntersectionDatabase, Keyframe
+from mineloc.data import F64, Fix, IntersectionDatabase, Keyframe, RelativePose
 from mineloc.localize.map_tracker import IntersectionTracker, Tracker
 from mineloc.localize.pose_filter import PoseFilter
 from mineloc.localize.recognition import Recognizer
-from mineloc.localize.relocalization import Relocalizer
+from mineloc.localize.relocalization import RecoveringTracker, Relocalizer
 from mineloc.localize.sequence import RoadwaySequence, ways_between
 from mineloc.places.database import database_of
 
@@ -109,3 +109,37 @@ def test_nobody_gets_from_one_to_another_in_less_than_the_way(database: Intersec
         assert edge is not None
         sequence.carry(edge)
     assert sequence.doubt(fix_of(database, "X 1")) == ""
+
+
+class Believer:
+    """A tracker that never sees anything that fits."""
+
+    def __init__(self, known: PoseFilter) -> None:
+        self.filter, self.fixes = known, []
+
+    def follow(self, keyframe: Keyframe, edge: RelativePose | None) -> None:
+        if edge is not None:
+            self.filter.carry(edge)
+        reason = "does not fit"
+        self.fixes.append(Fix(keyframe.stamp_ns, keyframe.index, None, None, trusted=False, reason=reason))
+
+
+def test_a_tracker_that_is_refused_for_long_is_found_anew(database: IntersectionDatabase) -> None:
+    def search() -> Relocalizer:
+        def track(known: PoseFilter) -> Tracker:
+            return IntersectionTracker(
+                Recognizer(CONFIG, database), RoadwaySequence(database, CONFIG.intersections), CONFIG, known
+            )
+
+        return Relocalizer(Recognizer(CONFIG, database), CONFIG, track)
+
+    keyframes, truth = flown(TwoIntersections(), -14.0, 42.0)
+    wrong = truth[0] @ se3.exp(np.array([0, 0, 0.3, 7.0, 2.0, 0]))
+    tracker = RecoveringTracker(Believer(PoseFilter(wrong, np.eye(6), CONFIG.graph)), search, after=3)
+    for keyframe, edge in zip(keyframes, edges_of(keyframes), strict=True):
+        tracker.follow(keyframe, edge)
+    assert tracker.filter is not None
+    assert np.linalg.norm((se3.inverse(truth[-1]) @ tracker.filter.T_map_lidar)[:3, 3]) < 0.3
+    assert [fix.keyframe for fix in tracker.fixes] == list(range(len(keyframes)))
+    assert [fix.reason for fix in tracker.fixes[:2]] == ["does not fit"] * 2
+    assert {fix.target for fix in tracker.fixes if fix.trusted} == {"T 0", "X 1"}
