@@ -20,6 +20,7 @@ from zstandard import ZstdError
 
 from mineloc.data import F32, F64, Intersection, IntersectionDatabase, Lineage, WallContour
 from mineloc.errors import FormatError
+from mineloc.io.foxglove_schemas import POINT_CLOUD, SCENE_UPDATE
 from mineloc.io.intersection_messages import cloud_message, points_and_normals, scene_message
 from mineloc.output import new_file
 
@@ -56,19 +57,20 @@ def write_database(path: Path, database: IntersectionDatabase, *, overwrite: boo
     with new_file(path, overwrite=overwrite) as temp, temp.open("wb") as stream:
         writer = Writer(stream, compression=CompressionType.ZSTD, use_statistics=True)
         writer.start(profile="", library="mineloc")
+        own = {"title": SCHEMA, "type": "object"}
         channels = {
             topic: writer.register_channel(
                 topic=topic,
                 message_encoding="json",
                 schema_id=writer.register_schema(
-                    name=schema, encoding="jsonschema", data=json.dumps({"title": schema, "type": "object"}).encode()
+                    name=schema["title"], encoding="jsonschema", data=json.dumps(schema, sort_keys=True).encode()
                 ),
             )
             for topic, schema in (
-                (_FACTS, SCHEMA),
-                (_RECORDS, SCHEMA),
-                (_CLOUDS, "foxglove.PointCloud"),
-                (_SCENE, "foxglove.SceneUpdate"),
+                (_FACTS, own),
+                (_RECORDS, own),
+                (_CLOUDS, POINT_CLOUD),
+                (_SCENE, SCENE_UPDATE),
             )
         }
         writer.add_metadata(SCHEMA, {})

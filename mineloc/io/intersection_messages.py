@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from mineloc.data import F32, Intersection, IntersectionDatabase
+from mineloc.io.foxglove_schemas import PRIMITIVES
 
 _POINT_BYTES = 24
 _FLOAT32 = 7  # of foxglove.PackedElementField
@@ -79,6 +80,8 @@ def _entity(one: Intersection) -> dict[str, Any]:
         "lifetime": {"sec": 0, "nsec": 0},
         "frame_locked": False,
         "metadata": [],
+        # a viewer that decodes by the schema wants every kind
+        **{kind: [] for kind in PRIMITIVES},
         "lines": [branches],
         "texts": [name],
     }

@@ -86,6 +86,31 @@ def test_others_find_messages_that_they_draw(tmp_path: Path) -> None:
     assert schemas.count("foxglove.SceneUpdate") == 1
 
 
+def fits(value: Any, schema: dict[str, Any]) -> bool:
+    """Whether a message is what a JSON Schema of the kind that Foxglove publishes says."""
+    kind = schema["type"]
+    if kind == "object":
+        own = schema["properties"]
+        return set(value) == set(own) and all(fits(value[name], part) for name, part in own.items())
+    if kind == "array":
+        return isinstance(value, list) and all(fits(item, schema["items"]) for item in value)
+    types = {"number": (int, float), "integer": int, "string": str, "boolean": bool}
+    return isinstance(value, types[kind])
+
+
+def test_messages_are_what_their_schemas_in_the_file_say(tmp_path: Path) -> None:
+    write_database(tmp_path / "a.mcap", some(3, 1))
+    checked: set[str] = set()
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        for schema, _, message in make_reader(stream).iter_messages():
+            assert schema is not None
+            if schema.name.startswith("foxglove."):
+                assert fits(json.loads(message.data), json.loads(schema.data))
+                assert not fits({}, json.loads(schema.data))
+                checked.add(schema.name)
+    assert checked == {"foxglove.PointCloud", "foxglove.SceneUpdate"}
+
+
 def test_a_flipped_bit_is_noticed(tmp_path: Path) -> None:
     path = tmp_path / "db.mcap"
     write_database(path, some(2, 5))
