@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import polars as pl
 
-from mineloc import se3
-from mineloc.data import Trajectory
 from mineloc.metrics.recognition import WRONG_DEG, WRONG_M
 from mineloc.report.along import Way
-from mineloc.stages.passages import Encounter, by_intersections, encounters, most_frequent, scores_of
+from mineloc.stages.passages import Encounter, by_intersections, encounters, errors_of, most_frequent, scores_of
 from mineloc.stages.recognitions import Recognition, recognition_of, step_of, wording_of
 from mineloc.stages.run_folder import RunFolder
-from mineloc.stages.run_tables import poses_of
 
 _LAST = 5
 _ASKS = {
@@ -102,15 +98,14 @@ def _score(scored: Recognition) -> dict[str, Any]:
 
 
 def _places(run: RunFolder, known: pl.DataFrame, scored: Recognition | None, way: Way) -> list[dict[str, Any]]:
-    lidar = None
-    if scored is not None and run.reference is not None:
-        lidar = run.reference.compose(right=run.T_body_lidar, child="lidar")
+    off = {} if scored is None or run.reference is None else errors_of(run, run.reference)
     origin = (run.manifest.get("map") or {}).get("grid_origin_m", [0.0, 0.0, 0.0])
     rows: list[dict[str, Any]] = []
     for one in encounters(run, known, None if scored is None else scored.score):
         place = known.row(one.row, named=True)
         accepted = run.fixes[one.accepted]
-        error_m, error_deg = _errors(lidar, accepted)
+        errors = [off[row] for row in one.accepted.tolist() if row in off]
+        error_m, error_deg = (max(each) for each in zip(*errors, strict=True)) if errors else (None, None)
         rows.append(
             {
                 "id": place["id"],
@@ -148,19 +143,6 @@ def _times(one: Encounter, accepted: pl.DataFrame, way: Way) -> dict[str, float 
         "first_s": (stamps[0] - start) * 1e-9 if stamps else None,
         "last_s": (stamps[-1] - start) * 1e-9 if stamps else None,
     }
-
-
-def _errors(lidar: Trajectory | None, accepted: pl.DataFrame) -> tuple[float | None, float | None]:
-    """The largest error of position and of angle; None outside the reference."""
-    if lidar is None:
-        return None, None
-    stamps = accepted["stamp_ns"].to_numpy()
-    within = (stamps >= lidar.stamps_ns[0]) & (stamps <= lidar.stamps_ns[-1])
-    if not within.any():
-        return None, None
-    away = se3.inverse(lidar.at(stamps[within])) @ poses_of(accepted)[within]
-    turns = np.degrees([se3.angle_rad(T) for T in away])
-    return float(np.linalg.norm(away[:, :3, 3], axis=1).max()), float(turns.max())
 
 
 def _refusal(run: RunFolder, one: Encounter) -> dict[str, Any]:

@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from mineloc.data import I64
+from mineloc import se3
+from mineloc.data import I64, Trajectory
 from mineloc.metrics.recognition import LEFT_M, Passage, RecognitionScore
 from mineloc.stages.recognitions import wording_of
 from mineloc.stages.run_folder import RunFolder
+from mineloc.stages.run_tables import poses_of
 
 _APART_M = 2.0 * LEFT_M
 """Fixes of one intersection with more metres flown between them belong to two passages."""
@@ -93,6 +95,25 @@ def most_frequent(reasons: Sequence[str]) -> tuple[str, int]:
     wording, count = min(counted.items(), key=lambda item: (-item[1], item[0]))
     whole = {reason for reason in reasons if wording_of(reason) == wording}
     return (whole.pop() if len(whole) == 1 else wording), count
+
+
+def errors_of(run: RunFolder, reference: Trajectory) -> dict[int, tuple[float, float]]:
+    """Metres and degrees that each accepted fix is off, by its row; those outside the reference are left out.
+
+    Args:
+        reference: `T_map_body`.
+    """
+    stamps = run.fixes["stamp_ns"].to_numpy()
+    within = (stamps >= reference.stamps_ns[0]) & (stamps <= reference.stamps_ns[-1])
+    rows = np.flatnonzero(within & run.fixes["trusted"].to_numpy())
+    if not len(rows):
+        return {}
+    rows = rows[np.argsort(stamps[rows], kind="stable")]
+    # all at once: each look-up walks through the whole reference
+    away = se3.inverse(reference.at(stamps[rows]) @ run.T_body_lidar) @ poses_of(run.fixes[rows])
+    metres = np.linalg.norm(away[:, :3, 3], axis=1)
+    degrees = np.degrees([se3.angle_rad(T) for T in away])
+    return dict(zip(rows.tolist(), zip(metres.tolist(), degrees.tolist(), strict=True), strict=True))
 
 
 def scores_of(run: RunFolder, row: int) -> dict[str, float | None]:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from mineloc import se3
 from mineloc.config import IntersectionsConfig
-from mineloc.data import F64, I64, Bool, Intersection, IntersectionDatabase, Sight, Trajectory, WallContour
-from mineloc.stages.passages import Encounter, encounters, scores_of
+from mineloc.data import F64, I64, Bool, Intersection, IntersectionDatabase, Sight, WallContour
+from mineloc.stages.passages import Encounter, encounters, errors_of, scores_of
 from mineloc.stages.recognitions import recognition_of
 from mineloc.stages.run_folder import RunFolder
 from mineloc.stages.run_tables import poses_of
@@ -69,21 +70,20 @@ class _Flight:
     odometry: F64
     points: F64
     begins: I64
-    reference: Trajectory | None
+    errors: Mapping[int, tuple[float, float]]
 
     @staticmethod
     def of(run: RunFolder) -> _Flight:
         table = run.points().sort("keyframe", maintain_order=True)
         index = run.keyframes["index"].to_numpy()
         begins = np.searchsorted(table["keyframe"].to_numpy(), np.append(index, index[-1:] + 1))
-        reference = run.reference
         return _Flight(
             run=run,
             index=index,
             odometry=poses_of(run.keyframes, prefix="odom_"),
             points=table.select("x_m", "y_m", "z_m").to_numpy().astype(np.float64),
             begins=begins,
-            reference=None if reference is None else reference.compose(right=run.T_body_lidar, child="lidar"),
+            errors={} if run.reference is None else errors_of(run, run.reference),
         )
 
     def evidence(self, one: Encounter, place: Intersection, threshold: float) -> Evidence:
@@ -109,7 +109,7 @@ class _Flight:
                 contour_threshold=threshold,
                 configuration=configuration,
                 predicted=self._predicted(row, pose),
-                error=self._error(stamp_ns, pose),
+                error=Away(*self.errors[one.best]) if one.best in self.errors else None,
             ),
             stamp_ns=stamp_ns,
             stored_m=_stored(place),
@@ -142,12 +142,6 @@ class _Flight:
             return None
         step = se3.inverse(self.odometry[row - 1]) @ self.odometry[row]
         return _away(online.poses[at] @ self.run.T_body_lidar @ step, pose)
-
-    def _error(self, stamp_ns: int, pose: F64) -> Away | None:
-        reference = self.reference
-        if reference is None or not reference.stamps_ns[0] <= stamp_ns <= reference.stamps_ns[-1]:
-            return None
-        return _away(reference.at(np.array([stamp_ns]))[0], pose)
 
 
 def stored_lines(contour: WallContour) -> list[F64]:

@@ -81,18 +81,18 @@ def flight_layout(
 
 def _recognitions() -> rrb.Container:
     """One recognition at a time, that of the time cursor; a line of the list takes the cursor to another."""
-    eye = rrb.EyeControls3D(position=(0.0, -9.0, 17.0), look_target=(0.0, -0.5, 0.5), eye_up=(0.0, 0.0, 1.0))
+    eye = rrb.EyeControls3D(position=(0.0, -11.0, 20.0), look_target=(0.0, -0.5, 0.5), eye_up=(0.0, 0.0, 1.0))
     clouds = rrb.Spatial3DView(origin="recognised", name="Stored and seen", eye_controls=eye, line_grid=False)
     contours = rrb.Spatial2DView(
         origin="contours",
-        name="Contours (PWCV)",
+        name="Contours (PWCV), a ring every 2 m",
         visual_bounds=rrb.VisualBounds2D(x_range=[-9.0, 9.0], y_range=[-9.0, 9.0]),
     )
     listed = rrb.TextLogView(origin="recognitions/list", name="Recognised, by time: click one")
     steps = rrb.TextDocumentView(origin="recognitions/steps", name="Why it was accepted")
     return rrb.Horizontal(
         rrb.Vertical(clouds, listed, row_shares=[3, 1]),
-        rrb.Vertical(contours, steps, row_shares=[2, 3]),
+        rrb.Vertical(contours, steps, row_shares=[1, 2]),
         column_shares=[3, 2],
         name="Recognitions",
     )

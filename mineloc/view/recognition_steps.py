@@ -76,8 +76,6 @@ def line_of(one: Accepted) -> str:
 def page_of(one: Accepted) -> str:
     """Markdown; names from outside are escaped."""
     rows = [f"| {step} | {what} | {number} | {needed} |" for step, what, number, needed in _rows(one)]
-    away = [f"- From where odometry put it: **{one.predicted or 'not known, the flight was being found'}**."]
-    away.append(f"- From the reference: **{one.error or 'not known, there is none'}**.")
     return "\n".join(
         [
             f"# {escaped(one.name)}",
@@ -89,10 +87,8 @@ def page_of(one: Accepted) -> str:
             "| ---: | --- | ---: | ---: |",
             *rows,
             "",
-            *away,
-            "",
-            "Grey: stored cloud without its roof. Yellow: points of the keyframes, placed by the accepted pose. Both "
-            "around the invariant point. Contours: green stored, yellow seen, from the few points that a run keeps.",
+            "Clouds: grey stored, without its roof; yellow the keyframes, placed by the accepted pose. Contours: green "
+            "stored; yellow seen, from the few points that a run keeps.",
         ]
     )
 
@@ -114,23 +110,26 @@ def _rows(one: Accepted) -> list[tuple[str, str, str, str]]:
     if one.is_tracked and tracked_threshold is not None:
         threshold = min(threshold, tracked_threshold)
     needed = one.limit("same_needed_known" if one.is_tracked else "same_needed")
+    least_margin = one.limit("matrix_margin")
     sigmas = one.limit("max_moved_sigmas", section="prior_map")
     return [
         ("1", "keyframes laid over each other", f"up to {_written(one.limit('window_keyframes'), 0)}", ""),
-        ("2", "intersection within reach", f"{one.reach_m:.1f} m", _most(one.limit("recognise_m"), 1, " m")),
-        ("", "branches seen", _written(s.get("branches"), 0), ""),
+        ("2", f"{_written(s.get('branches'), 0)} branches meet within reach", f"{one.reach_m:.1f} m",
+         _most(one.limit("recognise_m"), 1, " m")),
         ("3", "directions with a wall (PWCV)", _written(s.get("walls"), 0), ""),
         ("4", "contours alike", _written(_likeness(one), 2), _least(threshold, 2)),
         ("", "candidates that may be here", _written(candidates, 0), _least(1, 0)),
         ("5", "one candidate alone", "yes" if alone else "no", ""),
         ("6", "matrices alike (CWC)", "not asked" if best is None else _written(best, 2), ""),
-        ("", "better than the second by", _written(margin, 2), _least(one.limit("matrix_margin"), 2)),
+        *([] if margin is None else [("", "better than the second by", f"{margin:.2f}", _least(least_margin, 2))]),
         ("7, 8", "keyframes in a row that agree", _written(s.get("same"), 0), _least(needed, 0)),
         ("9", "inliers of the registration", _written(s.get("inlier_ratio"), 2),
          _least(one.limit("verify_inlier_ratio"), 2)),
         ("", "residual", _written(s.get("residual_m"), 3, " m"), _most(one.limit("verify_residual_m"), 3, " m")),
         ("", "moved by registration", _written(s.get("moved_m"), 2, " m"), ""),
         ("", "from the prediction", _written(s.get("sigmas"), 1, " sigmas"), _most(sigmas, 1, " sigmas")),
+        ("", "that is", "not found yet" if one.predicted is None else str(one.predicted), ""),
+        ("", "from the reference", "there is none" if one.error is None else str(one.error), ""),
     ]  # fmt: skip
 
 

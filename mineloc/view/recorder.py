@@ -176,11 +176,10 @@ class RunRecorder:
             self._during(entity, span_ns, columns, len(strips_m))
 
     def circles(self, entity: str, radii_m: Sequence[float]) -> None:
-        """Circles over ground around zero, always there, with their radii."""
+        """Circles over ground around zero, always there."""
         bearing = np.linspace(0.0, 2 * np.pi, 91)
         rings = [r * np.column_stack([np.cos(bearing), np.sin(bearing)]) for r in radii_m]
-        texts = [f"{r:g} m" for r in radii_m]
-        picture = rr.LineStrips2D(rings, colors=np.asarray(_DIM), radii=rr.Radius.ui_points(0.5), labels=texts)
+        picture = rr.LineStrips2D(rings, colors=np.asarray(_DIM), radii=rr.Radius.ui_points(0.5))
         self._stream.log(entity, picture, static=True)
 
     def _during(self, entity: str, span_ns: tuple[int, int | None], columns: rr.ComponentColumnList, n: int) -> None:

@@ -77,6 +77,9 @@ def test_a_flight_is_localized_in_the_map_of_others():
     assert plan.step("b localize odometry").needs() == ["b ingest"]
     assert plan.step("b localize map_tracking").needs() == ["b ingest", "m reconstruct", "m database"]
     assert plan.step("b localize intersections_map").needs() == ["b ingest", "m database"]
+    # the recording shows beside what was recognised what the database knew of it
+    for method, known_to in (("odometry", []), ("map_tracking", ["m database"]), ("intersections_map", ["m database"])):
+        assert plan.step(f"b record {method}").needs() == [f"b localize {method}", "b ingest", *known_to]
     assert [run.method for run in plan.runs] == ["odometry", "map_tracking", "intersections_map"]
     assert plan.steps[-1].needs() == [f"b localize {run.method}" for run in plan.runs]
     seen: set[str] = set()
