@@ -84,7 +84,7 @@ class Recognizer:
         """The nine steps."""
         look = self._watch.look(at.keyframe)  # steps 1 and 2
         if look is None:
-            return [self._stop(at, "no intersection within reach (step 2)")]
+            return [self._stop(at, f"no intersection within {self._config.recognise_m:g} m (step 2)")]
         candidates, reason = self._candidates(look, at)  # steps 3 and 4
         if candidates and (len(candidates) > 1 or at.known is None):  # step 5
             candidates, reason = self._told_apart(candidates, look, at)  # step 6
@@ -112,12 +112,11 @@ class Recognizer:
     def _candidates(self, look: Look, at: _At) -> tuple[list[_Candidate], str]:
         """Intersections whose contour is like this one and that may be here, the most alike first; or why none."""
         at.scores |= {"branches": float(len(look.junction.branches)), "walls": float(look.contour.walls)}
-        threshold = self._database.contour_threshold
-        if at.known is None:
-            found = self._index.matches(look.contour)
-        else:
+        threshold, among, reason = self._database.contour_threshold, None, ""
+        if at.known is not None:
             threshold = min(threshold, self._config.threshold_known)
-            found = self._index.matches(look.contour, self._near(look, at.known))
+            among, reason = self._near(look, at.known)
+        found = self._index.matches(look.contour, among)
         at.scores["similarity"] = found[0].similarity if found else 0.0
         alike = [self._placed(one, look) for one in found if one.similarity >= threshold]
         here = alike
@@ -129,9 +128,7 @@ class Recognizer:
             return here, ""
         if alike:
             return [], f"the pose rules out all {len(alike)} that look alike (step 4)"
-        if not found and at.known is not None and not len(self._near(look, at.known)):
-            return [], "no intersection of the database is where this one is seen (step 4)"
-        return [], f"similarity {at.scores['similarity']:.2f}, at least {threshold:.2f} needed (step 4)"
+        return [], reason or f"similarity {at.scores['similarity']:.2f}, at least {threshold:.2f} needed (step 4)"
 
     def _placed(self, match: ContourMatch, look: Look) -> _Candidate:
         known = self._database.intersections[match.row]
@@ -158,15 +155,19 @@ class Recognizer:
                 found.append(_Candidate(one, match.similarity, T_map_level, match.yaw_rad))
         return sorted(found, key=lambda one: -one.similarity)
 
-    def _near(self, look: Look, known: PoseFilter) -> I64:
-        """Indices of the intersections that may lie where the junction is seen."""
+    def _near(self, look: Look, known: PoseFilter) -> tuple[I64, str]:
+        """Indices of the intersections that may lie where the junction is seen; why none when there is none."""
         c = self._all.prior_map
         seen = se3.apply(known.T_map_lidar, look.point_lidar[None])[0]
         turn, shift = known.covariance[:3, :3], known.covariance[3:, 3:]
         arm = float(np.linalg.norm(look.point_lidar))
         sigma = np.sqrt(np.trace(shift) + np.trace(turn) * arm**2 + c.seen_floor_m**2)
         away = np.linalg.norm(self._points - seen, axis=1)
-        return np.flatnonzero(away < c.max_moved_sigmas * sigma)
+        near = np.flatnonzero(away < c.max_moved_sigmas * sigma)
+        if len(near):
+            return near, ""
+        nearest = f"{away.min():.0f} m from the nearest known one" if len(away) else "the database is empty"
+        return near, f"seen {nearest}, at most {c.max_moved_sigmas * sigma:.0f} m allowed (step 4)"
 
     def _may_be(self, T_map_lidar: F64, known: PoseFilter) -> bool:
         """Before registration: an invariant point is known to some decimetres, its turn to some degrees."""
@@ -193,7 +194,8 @@ class Recognizer:
         if at.known is None:
             return ranked, ""
         if second and best.matrix - second < self._config.matrix_margin:
-            return [], f"{len(candidates)} candidates are too much alike (step 6)"
+            apart = f"{best.matrix:.2f} and {second:.2f}, {self._config.matrix_margin:g} apart needed"
+            return [], f"{len(candidates)} candidates are too much alike: {apart} (step 6)"
         return [best], ""
 
     def _all_verified(self, candidates: Sequence[_Candidate], look: Look, at: _At) -> list[Fix]:

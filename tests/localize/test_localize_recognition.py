@@ -72,7 +72,7 @@ def test_another_mine_is_refused_with_the_step(database: IntersectionDatabase, b
 
 def test_a_position_that_excludes_all_is_a_reason(database: IntersectionDatabase) -> None:
     keyframes, truth = flown(TwoIntersections(), -14.0, 10.0)
-    for shift, reason in ((100.0, "is where this one is seen"), (0.0, "the pose rules out")):
+    for shift, reason in ((100.0, "from the nearest known one"), (0.0, "the pose rules out")):
         recognizer = Recognizer(CONFIG, database)
         fixes: list[Fix] = []
         for keyframe, T in zip(keyframes, truth, strict=True):
