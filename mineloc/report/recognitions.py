@@ -20,6 +20,7 @@ _ASKS = {
     "step 8": "Do keyframes in a row see the same one?",
     "step 9": "Does it register where odometry and roadways allow?",
     "not found yet": "Do enough intersections say where the flight is?",
+    "afterwards": "Do the other recognitions and odometry agree?",
 }
 """Of the nine steps those that can stop a recognition."""
 

@@ -15,6 +15,7 @@ from mineloc.metrics.recognition import RecognitionScore, recognition_score
 from mineloc.stages.run_folder import RunFolder
 from mineloc.stages.run_tables import poses_of
 
+_STEP = re.compile(r"\((step \d+|not found yet)\)$")
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
@@ -82,11 +83,15 @@ def refusals_by_step(fixes: pl.DataFrame) -> dict[str, int]:
 
 
 def step_of(reason: str) -> str:
-    """The step that a reason names at its end; `other` when it names none."""
-    return reason.rpartition("(")[2].rstrip(")") if reason.endswith(")") else "other"
+    """The step that a reason names at its end, `afterwards` for what others outvoted, else `other`."""
+    named = _STEP.search(reason)
+    if named is not None:
+        return named[1]
+    return "afterwards" if reason.startswith("outvoted") else "other"
 
 
 def wording_of(reason: str) -> str:
     """A reason without its numbers, but for that of its step: the same for all that stopped for the same cause."""
-    text, bracket, step = reason.rpartition(" (") if reason.endswith(")") else (reason, "", "")
-    return _NUMBER.sub("…", text) + bracket + step
+    named = _STEP.search(reason)
+    end = len(reason) if named is None else named.start()
+    return _NUMBER.sub("…", reason[:end]) + reason[end:]

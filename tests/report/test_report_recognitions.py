@@ -20,7 +20,7 @@ from mineloc.report.marks import shown_name
 from mineloc.report.numbers import WRITTEN
 from mineloc.report.page import write_report
 from mineloc.stages.passages import most_frequent
-from mineloc.stages.recognitions import recognition_of
+from mineloc.stages.recognitions import recognition_of, step_of
 from mineloc.stages.run_folder import RunFolder
 
 RUN = SyntheticRun(poses=1500)
@@ -196,6 +196,14 @@ def test_a_reason_is_told_in_full_where_it_never_differs():
     assert most_frequent(["a 1 (step 4)", "a 1 (step 4)", "b (step 2)"]) == ("a 1 (step 4)", 2)
     assert most_frequent(["a 1 (step 4)", "a 2 (step 4)"]) == ("a … (step 4)", 2)
     assert most_frequent(["b (step 9)", "a (step 9)"]) == ("a (step 9)", 1)
+
+
+def test_what_stands_in_brackets_is_not_always_a_step():
+    outvoted = [f"outvoted by 831 other recognitions and odometry (weight 0.0{k})" for k in range(3)]
+    assert {step_of(reason) for reason in outvoted} == {"afterwards"}
+    assert most_frequent(outvoted) == ("outvoted by … other recognitions and odometry (weight …)", 3)
+    assert step_of("2 places are possible (not found yet)") == "not found yet"
+    assert (step_of("overlap 0.31 < 0.6"), step_of("similarity 0.3 (step 4)")) == ("other", "step 4")
 
 
 def test_positions_are_those_of_the_mine_grid(scored):
