@@ -1,6 +1,7 @@
 """Whole surveys with all stages: equal results wherever they are made, and the demonstration."""
 
 import hashlib
+import json
 import os
 import subprocess
 import sys
@@ -59,3 +60,48 @@ def test_the_demonstration_executes_everything_once(tmp_path):
     assert (tmp_path / "demo" / "report" / "report.html").exists()
     second = mineloc("demo", "--local", cwd=tmp_path)
     assert (second.count("✓"), second.count(" known")) == (0, steps)
+
+
+MAPPED = """
+workers = 2
+[config.simulate]
+hover_s = 1.0
+grid_e_m = 1000.0
+target_every_m = 40.0
+[[flight]]
+name = "mapping"
+mine = "demo"
+methods = []
+[flight.config.simulate]
+length_m = 260.0
+seed = 3
+[[flight]]
+name = "night"
+mine = "demo"
+map = "level"
+methods = ["intersections", "intersections_map", "map_tracking"]
+[flight.config.simulate]
+length_m = 150.0
+seed = 4
+[[map]]
+name = "level"
+intersections = true
+"""
+
+
+def test_another_flight_is_localized_in_the_map_of_the_first(tmp_path):
+    (tmp_path / "s.toml").write_text(MAPPED)
+    mineloc("run", "s.toml", "--local", cwd=tmp_path)
+    out = tmp_path / "s.results"
+    for method in ("intersections_map", "map_tracking"):
+        scores = json.loads((out / "runs" / f"night-{method}" / "metrics.json").read_text())
+        (rmse,) = (
+            row["ape"]["translation_m"]["rmse"]
+            for row in scores["trajectories"][0]["aligned"]
+            if row["alignment"] == "none"
+        )
+        # neither was told where the flight begins
+        assert rmse < 0.15
+    found = json.loads((out / "runs" / "night-intersections_map" / "metrics.json").read_text())["recognition"]
+    assert found["wrong"] == 0
+    assert found["accepted"] > 0
