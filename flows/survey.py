@@ -21,9 +21,7 @@ from mineloc.survey.events import Event
 from mineloc.survey.plan import plan_survey
 from mineloc.survey.spec import read_survey
 
-TASKS = {
-    task.name: task for task in (simulate, ingest, reconstruct, database, localize, evaluate, record, report)
-}
+TASKS = {task.name: task for task in (simulate, ingest, reconstruct, database, localize, evaluate, record, report)}
 
 
 @flow(name="survey", persist_result=False, validate_parameters=False)
