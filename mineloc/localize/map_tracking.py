@@ -209,7 +209,8 @@ class MapTracking:
 
     def _first(self) -> tuple[F64, F64 | None]:
         """`T_map_odom` of the start and the covariance there: as given, as found later, or of a frame of its own."""
-        if self._prior.start is not None:
+        was_lost = isinstance(self._tracker, RecoveringTracker) and self._tracker.was_lost
+        if self._prior.start is not None and not was_lost:
             return self._origin, self._prior.start.covariance
         if not self._found:
             return self._origin, None

@@ -127,6 +127,9 @@ class RecoveringTracker:
         tracker: follows the flight.
         search: makes a `Relocalizer` of the same mine.
         after: keyframes in a row without a trusted fix.
+
+    Attributes:
+        was_lost: the flight was found anew: where it was told to begin need not be true.
     """
 
     def __init__(self, tracker: Tracker, search: Callable[[], Relocalizer], *, after: int) -> None:
@@ -134,6 +137,7 @@ class RecoveringTracker:
         self._search: Relocalizer | None = None
         self._before: list[Fix] = []
         self._refused = 0
+        self.was_lost = False
 
     @property
     def filter(self) -> PoseFilter | None:
@@ -161,3 +165,4 @@ class RecoveringTracker:
         own = self._search.fixes
         self._before = [*self._before, *self._tracker.fixes[: len(self._tracker.fixes) - len(own)]]
         self._tracker, self._search, self._refused = self._search, None, 0
+        self.was_lost = True

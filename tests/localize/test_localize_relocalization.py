@@ -141,5 +141,6 @@ def test_a_tracker_that_is_refused_for_long_is_found_anew(database: Intersection
     assert tracker.filter is not None
     assert np.linalg.norm((se3.inverse(truth[-1]) @ tracker.filter.T_map_lidar)[:3, 3]) < 0.3
     assert [fix.keyframe for fix in tracker.fixes] == list(range(len(keyframes)))
+    assert tracker.was_lost
     assert [fix.reason for fix in tracker.fixes[:2]] == ["does not fit"] * 2
     assert {fix.target for fix in tracker.fixes if fix.trusted} == {"T 0", "X 1"}
