@@ -154,10 +154,13 @@ def main() -> None:
         similarity_matrices(
             work / "results" / "maps" / "edgar.intersections.mcap", chosen.pictures / "paper_a_similarity.png"
         )
+    some = "" if chosen.methods == list(METHODS) else f" --methods {' '.join(chosen.methods)}"
+    seeds = " ".join(map(str, chosen.seeds))
     flown = (
-        f"`python benchmarks/paper_a.py --length-m {chosen.length_m:g} --seeds {' '.join(map(str, chosen.seeds))}`: "
+        f"`python benchmarks/paper_a.py --length-m {chosen.length_m:g} --seeds {seeds}{some}`: "
         f"map and database of a mapping flight of {chosen.mapping_m:g} m (seed {chosen.mapping_seed}, control points "
-        f"every 250 m), VLP-16, mesh `{chosen.mesh.stem}`; of each number the worst of {len(flights)} flights."
+        f"every 250 m), VLP-16, mesh `{chosen.mesh.stem}`; "
+        + (f"of each number the worst of {len(flights)} flights." if len(flights) > 1 else "one flight.")
     )
     print(flown, *lines, sep="\n")
     if not chosen.no_readme:
