@@ -51,13 +51,17 @@ class Recognition:
 
 
 def recognition_of(run: RunFolder, reference: Trajectory) -> Recognition | None:
-    """Score a run that was given a database and found itself in its map; None for any other.
+    """Score a run that localized by its database and found itself in the map; None for any other.
+
+    A run that the map itself holds recognises intersections only where it is lost.
 
     Args:
         reference: `T_map_body`.
     """
     known = run.intersections()
     if known is None or run.manifest.get("map") is None or not run.manifest["map"].get("found", True):
+        return None
+    if (run.fixes["target"] == "map").any():
         return None
     row = {name: k for k, name in enumerate(known["name"].to_list())}
     accepted = run.fixes.filter(pl.col("trusted") & pl.col("target").is_in(list(row))).sort("stamp_ns")

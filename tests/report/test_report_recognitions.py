@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
+from dataclasses import replace
 from html import unescape
 from pathlib import Path
 
@@ -213,3 +214,10 @@ def test_positions_are_those_of_the_mine_grid(scored):
         row = known.row(one["id"], named=True)
         told = [one["position_m"][axis] for axis in "xyz"]
         assert told == pytest.approx((np.array([row["x_m"], row["y_m"], row["z_m"]]) + ORIGIN).tolist())
+
+
+def test_a_run_that_the_map_holds_has_no_recall(scored):
+    run = RunFolder.open(scored[3])
+    assert recognition_of(run, run.reference) is not None
+    held = run.fixes.with_columns(target=pl.when(pl.col("trusted")).then(pl.lit("map")).otherwise(pl.col("target")))
+    assert recognition_of(replace(run, fixes=held), run.reference) is None
