@@ -1,0 +1,5 @@
+"""`python -m mineloc.cli`."""
+
+from mineloc.cli import main
+
+main()
