@@ -16,9 +16,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from readme_table import write_readme
+
 ROOT = Path(__file__).resolve().parents[1]
 MESH = ROOT.parent / "shared" / "data" / "meshes" / "edgar_mine" / "edgar_mine_rough_200k.ply"
-START, END = "<!-- edgar table -->", "<!-- end of edgar table -->"
 RUNS = {
     "odometry": ("odometry", "odometry", []),
     "odometry_no_imu": ("odometry, no IMU", "odometry", ["--set", "odometry.use_imu=false"]),
@@ -77,14 +78,6 @@ def _cells(scored: dict[str, Any]) -> list[str]:
     return [*cells, f"{hundred_m:.3f}", f"{100 * scored['coverage']['path']:.1f}"]
 
 
-def write_readme(text: str, flown: str) -> None:
-    """Put the table, and how it was made, between the markers."""
-    readme = ROOT / "README.md"
-    before, _, rest = readme.read_text(encoding="utf-8").partition(START)
-    _, _, after = rest.partition(END)
-    readme.write_text(f"{before}{START}\n{flown}\n\n{text}\n{END}{after}", encoding="utf-8")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, required=True, help="folder for the flight (15 GB each) and the runs")
@@ -103,7 +96,7 @@ def main() -> None:
         f"{reference['reference_path_m']:.0f} m in {reference['reference_duration_s']:.0f} s, VLP-16, "
         f"mesh `{chosen.mesh.stem}`."
     )
-    write_readme(table(results), flown)
+    write_readme("edgar", table(results), flown)
 
 
 if __name__ == "__main__":

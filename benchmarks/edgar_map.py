@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 from map_pictures import cross_section, top_view
+from readme_table import write_readme
 
 from mineloc import se3
 from mineloc.data import SurfaceKind, Trajectory
@@ -35,7 +36,6 @@ from mineloc.stages.run_tables import poses_of
 
 ROOT = Path(__file__).resolve().parents[1]
 MESH = ROOT.parent / "shared" / "data" / "meshes" / "edgar_mine" / "edgar_mine_rough_200k.ply"
-START, END = "<!-- map table -->", "<!-- end of map table -->"
 RUNS = {"loops": ("loop closures alone", ["--no-control"]), "control": ("and control points", [])}
 COLUMNS = (
     "map from", "RMSE m (none)", "RMSE m (origin)", "RMSE m (se3)", "max m (se3)", "check points RMSE m",
@@ -156,14 +156,6 @@ def row(name: str, result: dict[str, Any], errors: dict[str, dict[str, float]], 
     return "| " + " | ".join(cells) + " |"
 
 
-def write_readme(text: str, flown: str) -> None:
-    """Put the table, and how it was made, between the markers."""
-    readme = ROOT / "README.md"
-    before, _, rest = readme.read_text(encoding="utf-8").partition(START)
-    _, _, after = rest.partition(END)
-    readme.write_text(f"{before}{START}\n{flown}\n\n{text}\n{END}{after}", encoding="utf-8")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, required=True, help="folder for the flight (16 GB) and the maps")
@@ -198,7 +190,7 @@ def main() -> None:
     )
     print(flown, *lines, sep="\n")
     if not chosen.no_readme:
-        write_readme("\n".join(lines), flown)
+        write_readme("map", "\n".join(lines), flown)
 
 
 if __name__ == "__main__":

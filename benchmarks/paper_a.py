@@ -21,11 +21,10 @@ from typing import Any
 import numpy as np
 from edgar_map import MESH, mineloc
 from error_maps import error_maps, similarity_matrices
+from readme_table import write_readme
 
 from mineloc.io.flight import FlightReader
 
-ROOT = Path(__file__).resolve().parents[1]
-START, END = "<!-- paper a table -->", "<!-- end of paper a table -->"
 METHODS = (
     "loam", "loam_scan_context", "link3d_scan_context", "intersections", "intersections_map", "map_tracking",
 )  # fmt: skip
@@ -114,14 +113,6 @@ def _line(cells: list[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def write_readme(text: str, flown: str) -> None:
-    """Put the table, and how it was made, between the markers."""
-    readme = ROOT / "README.md"
-    before, _, rest = readme.read_text(encoding="utf-8").partition(START)
-    _, _, after = rest.partition(END)
-    readme.write_text(f"{before}{START}\n{flown}\n\n{text}\n{END}{after}", encoding="utf-8")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, required=True, help="folder for flights and results")
@@ -164,7 +155,7 @@ def main() -> None:
     )
     print(flown, *lines, sep="\n")
     if not chosen.no_readme:
-        write_readme("\n".join(lines), flown)
+        write_readme("paper a", "\n".join(lines), flown)
 
 
 if __name__ == "__main__":
