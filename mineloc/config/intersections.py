@@ -66,3 +66,4 @@ class IntersectionsConfig(Section):
     verify_radius_m: float = Field(default=12.0, gt=0, description="points around the intersection that are registered")
     verify_inlier_ratio: float = Field(default=0.7, gt=0, le=1)
     verify_residual_m: float = Field(default=0.06, gt=0)
+    verify_sigma_m: float = Field(default=0.3, gt=0, description="of the position in its least certain direction")

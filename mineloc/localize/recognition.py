@@ -251,6 +251,10 @@ class Recognizer:
             return f"inlier ratio {found.inlier_ratio:.2f}, at least {c.verify_inlier_ratio} needed (step 9)"
         if not found.residual_m <= c.verify_residual_m:
             return f"residual {found.residual_m:.3f} m, at most {c.verify_residual_m} m allowed (step 9)"
+        # METHOD 5.1 (8): the translation must be held in every direction
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(found.covariance[3:, 3:])[-1]))
+        if sigma_m > c.verify_sigma_m:
+            return f"position known to {sigma_m:.2f} m in one direction, {c.verify_sigma_m} m needed (step 9)"
         return ""
 
     def _map_of(self, known: Intersection) -> PriorMap:

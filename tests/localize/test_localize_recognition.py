@@ -82,3 +82,16 @@ def test_a_position_that_excludes_all_is_a_reason(database: IntersectionDatabase
         assert not any(fix.trusted for fix in fixes)
         assert {fix.reason.split("(")[-1] for fix in fixes} <= {"step 2)", "step 4)"}
         assert any(reason in fix.reason for fix in fixes)
+
+
+def test_a_position_that_is_open_in_a_direction_is_refused(database: IntersectionDatabase) -> None:
+    demanding = CONFIG.model_copy(
+        update={"intersections": CONFIG.intersections.model_copy(update={"verify_sigma_m": 0.01})}
+    )
+    recognizer = Recognizer(demanding, database)
+    keyframes, truth = flown(TwoIntersections(), -14.0, 10.0)
+    fixes = [recognizer.follow(keyframe, at(T)) for keyframe, T in zip(keyframes, truth, strict=True)]
+    verified = [fix for fix in fixes if "inlier_ratio" in fix.scores]
+    assert verified
+    assert not any(fix.trusted for fix in fixes)
+    assert all("in one direction, 0.01 m needed (step 9)" in fix.reason for fix in verified)
