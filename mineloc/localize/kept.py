@@ -60,6 +60,7 @@ class Kept:
         loops: Sequence[RelativePose] = (),
         fixes: Sequence[Fix] = (),
         in_map: bool = True,
+        start_off_m: float | None = None,
     ) -> Localization:
         """The answer: the smoothed keyframes spread over all sweeps."""
         stamps = np.array([step.stamp_ns for step in self.steps])
@@ -77,6 +78,7 @@ class Kept:
             counts=counts,
             seconds=dict(self.clock.seconds),
             in_map=in_map,
+            start_off_m=start_off_m,
         )
 
 

@@ -42,6 +42,7 @@ class Localization:
         counts: what the front end counted, by name.
         seconds: by module, one entry a call.
         in_map: False where a flight never found itself in the map: then all poses are in a frame of its own.
+        start_off_m: how far from the start that was told it began, where the map refuted that start; else None.
     """
 
     smoothed: Trajectory
@@ -56,6 +57,7 @@ class Localization:
     counts: Mapping[str, int]
     seconds: dict[str, list[float]]
     in_map: bool = True
+    start_off_m: float | None = None
 
 
 @dataclass(slots=True)

@@ -130,3 +130,13 @@ def correct_by(known: PoseFilter, fix: Fix, config: Config) -> None:
         known.correct_by_point(PointFix.of(fix))
     else:
         known.correct(fix)
+
+
+def contradicts_map(fix: Fix) -> bool:
+    """Whether a fix of a `MapTracker` speaks against the pose: wherever the drone is, it sees the map."""
+    return not fix.trusted
+
+
+def contradicts_database(fix: Fix) -> bool:
+    """Whether a fix of an `IntersectionTracker` does: a junction was seen, and none that is known fits there."""
+    return not fix.trusted and "branches" in fix.scores

@@ -18,7 +18,13 @@ from mineloc.graph.pose_graph import PoseGraph
 from mineloc.localize.flown import counts_of, first_origin, front_end_steps
 from mineloc.localize.kept import Kept
 from mineloc.localize.localization import FlightData, Localization
-from mineloc.localize.map_tracker import IntersectionTracker, MapTracker, Tracker
+from mineloc.localize.map_tracker import (
+    IntersectionTracker,
+    MapTracker,
+    Tracker,
+    contradicts_database,
+    contradicts_map,
+)
 from mineloc.localize.pose_filter import PoseFilter
 from mineloc.localize.prior_map import PriorMap
 from mineloc.localize.recognition import Recognizer
@@ -104,20 +110,25 @@ class Prior:
         return Relocalizer(Recognizer(config, self.database), config, lambda known: self._track(config, known, by))
 
     def _track(self, config: Config, known: PoseFilter, by: By) -> Tracker:
-        database = self.database
+        """Once its pose is known; a flight that the map contradicts for long is searched for anew."""
+        tracker, database = self._by(config, known, by), self.database
+        if database is None:
+            return tracker
+
+        def search() -> Relocalizer:
+            return Relocalizer(Recognizer(config, database), config, lambda found: self._track(config, found, by))
+
+        return RecoveringTracker(
+            tracker, search, contradicts_map if by == "map" else contradicts_database, config.prior_map
+        )
+
+    def _by(self, config: Config, known: PoseFilter, by: By) -> Tracker:
         if by == "map":
             assert self.map is not None
-            tracker = MapTracker(self.map, config, known)
-            if database is None:
-                return tracker
-            return RecoveringTracker(
-                tracker,
-                lambda: Relocalizer(Recognizer(config, database), config, lambda found: self._track(config, found, by)),
-                after=config.prior_map.lost_after,
-            )
-        assert database is not None
-        sequence = RoadwaySequence(database, config.intersections)
-        return IntersectionTracker(Recognizer(config, database), sequence, config, known)
+            return MapTracker(self.map, config, known)
+        assert self.database is not None
+        sequence = RoadwaySequence(self.database, config.intersections)
+        return IntersectionTracker(Recognizer(config, self.database), sequence, config, known)
 
 
 class MapTracking:
@@ -183,7 +194,16 @@ class MapTracking:
             fixes = self._agreed(self._tracker.fixes)
             solution = self._solved(fixes)
         counts = counts_of(self._front_end)
-        return self._kept.told(solution, counts=counts, fixes=fixes, in_map=self._found)
+        off_m = self._start_off_m(solution) if self._was_lost else None
+        return self._kept.told(solution, counts=counts, fixes=fixes, in_map=self._found, start_off_m=off_m)
+
+    @property
+    def _was_lost(self) -> bool:
+        return isinstance(self._tracker, RecoveringTracker) and self._tracker.was_lost
+
+    def _start_off_m(self, solution: Solution) -> float:
+        told = self._origin @ self._kept.keyframes[0].T_odom_lidar
+        return float(np.linalg.norm(solution.poses[0][:3, 3] - told[:3, 3]))
 
     def _agreed(self, fixes: list[Fix]) -> list[Fix]:
         """Recognitions that the others outvote are refused; one wrong id must not bend the trajectory."""
@@ -209,8 +229,7 @@ class MapTracking:
 
     def _first(self) -> tuple[F64, F64 | None]:
         """`T_map_odom` of the start and the covariance there: as given, as found later, or of a frame of its own."""
-        was_lost = isinstance(self._tracker, RecoveringTracker) and self._tracker.was_lost
-        if self._prior.start is not None and not was_lost:
+        if self._prior.start is not None and not self._was_lost:
             return self._origin, self._prior.start.covariance
         if not self._found:
             return self._origin, None

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mineloc.config import Config
+from mineloc.config import Config, PriorMapConfig
 from mineloc.data import Fix, Keyframe, RelativePose
 from mineloc.localize.map_tracker import Tracker, correct_by
 from mineloc.localize.pose_filter import PoseFilter
@@ -126,14 +126,21 @@ class RecoveringTracker:
     Args:
         tracker: follows the flight.
         search: makes a `Relocalizer` of the same mine.
-        after: keyframes in a row without a trusted fix.
+        refused: which fix speaks against the pose; one that merely saw nothing does not.
+        config: section `prior_map`: after how many such fixes without a trusted one; gates.
 
     Attributes:
-        was_lost: the flight was found anew: where it was told to begin need not be true.
+        was_lost: the flight was found elsewhere: where it was told to begin need not be true.
     """
 
-    def __init__(self, tracker: Tracker, search: Callable[[], Relocalizer], *, after: int) -> None:
-        self._tracker, self._make, self._after = tracker, search, after
+    def __init__(
+        self,
+        tracker: Tracker,
+        search: Callable[[], Relocalizer],
+        refused: Callable[[Fix], bool],
+        config: PriorMapConfig,
+    ) -> None:
+        self._tracker, self._make, self._is_refused, self._config = tracker, search, refused, config
         self._search: Relocalizer | None = None
         self._before: list[Fix] = []
         self._refused = 0
@@ -152,17 +159,25 @@ class RecoveringTracker:
     def follow(self, keyframe: Keyframe, edge: RelativePose | None) -> None:
         """As `Tracker.follow`."""
         self._tracker.follow(keyframe, edge)
-        self._refused = 0 if self._tracker.fixes[-1].trusted else self._refused + 1
-        if self._refused < self._after:
+        newest = self._tracker.fixes[-1]
+        self._refused = 0 if newest.trusted else self._refused + self._is_refused(newest)
+        if self._refused < self._config.lost_after:
             self._search = None
             return
         if self._search is None:
             self._search, edge = self._make(), None
         self._search.follow(keyframe, edge)
-        if self._search.filter is None:
+        found = self._search.filter
+        if found is None:
             return
+        self.was_lost = self.was_lost or self._is_elsewhere(found)
         # from here on the search is what follows the flight; what the tracker said meanwhile was refused
         own = self._search.fixes
         self._before = [*self._before, *self._tracker.fixes[: len(self._tracker.fixes) - len(own)]]
         self._tracker, self._search, self._refused = self._search, None, 0
-        self.was_lost = True
+
+    def _is_elsewhere(self, found: PoseFilter) -> bool:
+        c, believed = self._config, self._tracker.filter
+        assert believed is not None
+        away = believed.sigmas_away(found.T_map_lidar, floor_m=c.moved_floor_m, floor_deg=c.moved_floor_deg)
+        return away > c.max_moved_sigmas

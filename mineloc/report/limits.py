@@ -55,6 +55,20 @@ def _of_map(values: Mapping[str, Any]) -> list[str]:
             "flight does. They say how it flew, not where in the mine. Which intersections it passed could not be "
             f"decided.{why}"
         ]
+    return _of_start(known) + _of_recognitions(known, recognitions)
+
+
+def _of_start(known: Mapping[str, Any]) -> list[str]:
+    off_m = known["start_off_m"]
+    if off_m is None:
+        return []
+    return [
+        f"The flight was told to begin {off_m:.1f} m from where it did: the map contradicted that, and the flight was "
+        "found anew by its intersections. Online positions before that are wrong."
+    ]
+
+
+def _of_recognitions(known: Mapping[str, Any], recognitions: Mapping[str, Any] | None) -> list[str]:
     if recognitions is None or recognitions["places"] is None:
         return []
     if recognitions["score"] is None:

@@ -36,6 +36,7 @@ def map_facts(run: RunFolder, way: Way) -> dict[str, Any] | None:
         "grid_origin_m": list(known["grid_origin_m"]),
         "is_grid": bool(known["is_grid"]),
         "found": found,
+        "start_off_m": known.get("start_off_m"),
         "last_refusals": [] if found else _last_refusals(run, way),
     }
 

@@ -50,6 +50,7 @@ class LocalizeResult:
         path_m: length of the smoothed trajectory.
         sweeps_per_s, real_time_factor: of the whole run, reading included.
         in_map: False where the flight never found itself in the map: its poses are in a frame of its own.
+        start_off_m: how far from the start that was told it began, where the map refuted that start; else None.
     """
 
     out: Path
@@ -63,6 +64,7 @@ class LocalizeResult:
     sweeps_per_s: float
     real_time_factor: float
     in_map: bool
+    start_off_m: float | None
 
     def to_dict(self) -> dict[str, Any]:
         """For `--json`."""
@@ -75,6 +77,8 @@ class LocalizeResult:
         found = f"{self.fixes} of {tried} fixes accepted\n" if tried else ""
         if not self.in_map:
             found += "NOT FOUND in the map: the poses are in a frame of their own, from the start of the flight\n"
+        if self.start_off_m is not None:
+            found += f"WRONG START: the flight began {self.start_off_m:.1f} m from where prior_map.start_m says\n"
         return (
             f"{self.out}: {self.sweeps} sweeps, {self.keyframes} keyframes, {self.path_m:.1f} m; {doubt}\n"
             f"{found}"
@@ -141,7 +145,7 @@ def localize(
             timing=timing,
             manifest={
                 **_manifest(flight, reader, method, chosen, config, counts),
-                "map": None if known is None else {**known.facts, "found": found.in_map},
+                "map": None if known is None else {**known.facts, **_in_map(found)},
             },
         )
     return LocalizeResult(
@@ -156,6 +160,7 @@ def localize(
         sweeps_per_s=timing["sweeps_per_s"],
         real_time_factor=timing["real_time_factor"],
         in_map=found.in_map,
+        start_off_m=found.start_off_m,
     )
 
 
@@ -243,6 +248,11 @@ def _percentiles(seconds: Sequence[float]) -> Mapping[str, float]:
         "p95_ms": float(np.percentile(ms, 95)),
         "max_ms": float(ms.max()),
     }
+
+
+def _in_map(found: Localization) -> Mapping[str, Any]:
+    """What became of a flight in a map."""
+    return {"found": found.in_map, "start_off_m": found.start_off_m}
 
 
 def _manifest(

@@ -10,7 +10,7 @@ from plan_scenes import Plan, TwoIntersections, edges_of, flown
 from mineloc import se3
 from mineloc.config import Config
 from mineloc.data import F64, Fix, IntersectionDatabase, Keyframe, RelativePose
-from mineloc.localize.map_tracker import IntersectionTracker, Tracker
+from mineloc.localize.map_tracker import IntersectionTracker, Tracker, contradicts_database, contradicts_map
 from mineloc.localize.pose_filter import PoseFilter
 from mineloc.localize.recognition import Recognizer
 from mineloc.localize.relocalization import RecoveringTracker, Relocalizer
@@ -111,6 +111,11 @@ def test_nobody_gets_from_one_to_another_in_less_than_the_way(database: Intersec
     assert sequence.doubt(fix_of(database, "X 1")) == ""
 
 
+def soon_lost(after: int) -> Config:
+    """A tracker is searched for anew after so few refusals."""
+    return CONFIG.model_copy(update={"prior_map": CONFIG.prior_map.model_copy(update={"lost_after": after})})
+
+
 class Believer:
     """A tracker that never sees anything that fits."""
 
@@ -135,7 +140,8 @@ def test_a_tracker_that_is_refused_for_long_is_found_anew(database: Intersection
 
     keyframes, truth = flown(TwoIntersections(), -14.0, 42.0)
     wrong = truth[0] @ se3.exp(np.array([0, 0, 0.3, 7.0, 2.0, 0]))
-    tracker = RecoveringTracker(Believer(PoseFilter(wrong, np.eye(6), CONFIG.graph)), search, after=3)
+    believer = Believer(PoseFilter(wrong, np.diag([0.01] * 3 + [0.25] * 3), CONFIG.graph))
+    tracker = RecoveringTracker(believer, search, contradicts_map, soon_lost(3).prior_map)
     for keyframe, edge in zip(keyframes, edges_of(keyframes), strict=True):
         tracker.follow(keyframe, edge)
     assert tracker.filter is not None
@@ -143,4 +149,44 @@ def test_a_tracker_that_is_refused_for_long_is_found_anew(database: Intersection
     assert [fix.keyframe for fix in tracker.fixes] == list(range(len(keyframes)))
     assert tracker.was_lost
     assert [fix.reason for fix in tracker.fixes[:2]] == ["does not fit"] * 2
+    assert {fix.target for fix in tracker.fixes if fix.trusted} == {"T 0", "X 1"}
+
+
+def by_intersections(
+    database: IntersectionDatabase, config: Config, keyframes: list[Keyframe], T_map_lidar: F64
+) -> RecoveringTracker:
+    """A flight told to begin at a pose, all keyframes shown."""
+
+    def track(known: PoseFilter) -> Tracker:
+        sequence = RoadwaySequence(database, config.intersections)
+        return IntersectionTracker(Recognizer(config, database), sequence, config, known)
+
+    told = PoseFilter(T_map_lidar, np.diag([np.radians(3.0) ** 2] * 3 + [0.25] * 3), config.graph)
+    tracker = RecoveringTracker(
+        track(told),
+        lambda: Relocalizer(Recognizer(config, database), config, track),
+        contradicts_database,
+        config.prior_map,
+    )
+    for keyframe, edge in zip(keyframes, edges_of(keyframes), strict=True):
+        tracker.follow(keyframe, edge)
+    return tracker
+
+
+def test_a_wrong_start_is_noticed_by_the_intersections_that_do_not_fit(database: IntersectionDatabase) -> None:
+    keyframes, truth = flown(TwoIntersections(), -14.0, 42.0)
+    wrong = truth[0] @ se3.exp(np.array([0, 0, 0.0, 30.0, 20.0, 0]))
+    stubborn = by_intersections(database, CONFIG, keyframes, wrong)
+    assert not any(fix.trusted for fix in stubborn.fixes)
+    tracker = by_intersections(database, soon_lost(3), keyframes, wrong)
+    assert tracker.was_lost
+    assert tracker.filter is not None
+    assert np.linalg.norm((se3.inverse(truth[-1]) @ tracker.filter.T_map_lidar)[:3, 3]) < 0.3
+    assert {fix.target for fix in tracker.fixes if fix.trusted} == {"T 0", "X 1"}
+
+
+def test_a_right_start_is_not_searched_for(database: IntersectionDatabase) -> None:
+    keyframes, truth = flown(TwoIntersections(), -14.0, 42.0)
+    tracker = by_intersections(database, soon_lost(1), keyframes, truth[0])
+    assert not tracker.was_lost
     assert {fix.target for fix in tracker.fixes if fix.trusted} == {"T 0", "X 1"}

@@ -151,6 +151,16 @@ def test_a_flight_that_was_not_found_says_so_first(tmp_path, synthetic_run):
     assert "T 0" not in html[html.index("<svg") : html.index("</svg>")]
 
 
+def test_a_start_that_the_map_refuted_is_told(tmp_path, synthetic_run):
+    run, _ = recognition_run(tmp_path, synthetic_run(RUN))
+    manifest = json.loads((run / "manifest.json").read_text())
+    manifest["map"]["start_off_m"] = 35.21
+    (run / "manifest.json").write_text(json.dumps(manifest))
+    _, document, html = reported(tmp_path, run)
+    assert "was told to begin 35.2 m from where it did" in html
+    assert any("35.2 m" in limit for limit in document["runs"][0]["limits"])
+
+
 def test_a_run_without_a_map_is_as_before(tmp_path, synthetic_run):
     page, document, _ = reported(tmp_path, synthetic_run(RUN))
     assert document["runs"][0]["map"] is None
