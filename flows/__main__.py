@@ -25,6 +25,8 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--set", action="append", default=[], dest="overrides")
     parser.add_argument("--server")
+    parser.add_argument("--runner", default="process")
+    parser.add_argument("--address")
     parser.add_argument("--events", type=int, help="file descriptor that takes events as lines of JSON")
     given = parser.parse_args()
     if given.events is not None:
@@ -58,7 +60,14 @@ def _flow(given: argparse.Namespace) -> None:
     from flows.survey import survey
 
     try:
-        survey(str(given.survey), out=str(given.out), overrides=given.overrides, events=given.events)
+        survey(
+            str(given.survey),
+            out=str(given.out),
+            overrides=given.overrides,
+            events=given.events,
+            runner=given.runner,
+            address=given.address,
+        )
     finally:
         logging.shutdown()  # sends what was logged while the server is there
 

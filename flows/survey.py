@@ -19,19 +19,29 @@ from mineloc.errors import MinelocError
 from mineloc.survey.engine import engine
 from mineloc.survey.events import Event
 from mineloc.survey.plan import plan_survey
+from mineloc.survey.runner import Runner
 from mineloc.survey.spec import read_survey
 
 TASKS = {task.name: task for task in (simulate, ingest, reconstruct, database, localize, evaluate, record, report)}
 
 
 @flow(name="survey", persist_result=False, validate_parameters=False)
-def survey(path: str, *, out: str, overrides: list[str] | None = None, events: int | None = None) -> None:
+def survey(
+    path: str,
+    *,
+    out: str,
+    overrides: list[str] | None = None,
+    events: int | None = None,
+    runner: str = "process",
+    address: str | None = None,
+) -> None:
     """Run a survey file.
 
     Args:
         out: the survey's folder.
         overrides: `section.key=value`.
         events: file descriptor that takes events as lines of JSON.
+        runner, address: which workers: "process", or "dask" and where its scheduler is.
 
     Raises:
         MinelocError: of the first step that failed, after everything that does not need it is done.
@@ -43,7 +53,7 @@ def survey(path: str, *, out: str, overrides: list[str] | None = None, events: i
 
     plan = plan_survey(read_survey(Path(path), overrides or (), out=Path(out)))
     futures: dict[str, PrefectFuture[Any]] = {}
-    with engine(plan, tell) as work:
+    with engine(plan, tell, Runner.named(runner, address)) as work:
         for step in plan.steps:
             made = {name: futures[name] for name in step.needs()}
             futures[step.name] = TASKS[step.stage.name].submit(work, opaque(step), made)

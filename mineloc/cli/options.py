@@ -21,6 +21,12 @@ ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file o
 SetOption = Annotated[list[str] | None, typer.Option("--set", help="Override one key: section.key=value. Repeatable.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable results on stdout; all else on stderr.")]
 LocalOption = Annotated[bool, typer.Option("--local", help="Without Prefect.")]
+RunnerOption = Annotated[
+    str, typer.Option("--runner", help="Where stages run: process (this machine) or dask (a cluster's workers).")
+]
+AddressOption = Annotated[
+    str | None, typer.Option("--address", help="Of the Dask scheduler, tcp://host:8786; the machines share the folder.")
+]
 ServerOption = Annotated[str | None, typer.Option("--server", help="Address of a running Prefect server.")]
 
 

@@ -3,11 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mineloc.cli.options import JsonOption, LocalOption, ServerOption, SetOption, app, write_json
+from mineloc.cli.options import (
+    AddressOption,
+    JsonOption,
+    LocalOption,
+    RunnerOption,
+    ServerOption,
+    SetOption,
+    app,
+    write_json,
+)
+
+if TYPE_CHECKING:
+    from mineloc.survey.runner import Runner
 
 
 @app.command()
@@ -16,11 +28,16 @@ def run(
     out: Annotated[Path | None, typer.Option("--out", help="Folder of the results, over the file's own word.")] = None,
     local: LocalOption = False,
     server: ServerOption = None,
+    runner: RunnerOption = "process",
+    address: AddressOption = None,
     as_json: JsonOption = False,
     overrides: SetOption = None,
 ) -> None:
     """All stages of all flights of a survey, each executed once; as one Prefect flow."""
-    _survey(survey, out, local=local, server=server, as_json=as_json, overrides=overrides)
+    from mineloc.survey.runner import Runner
+
+    on = Runner.named(runner, address)
+    _survey(survey, out, local=local, server=server, as_json=as_json, overrides=overrides, runner=on)
 
 
 @app.command()
@@ -32,12 +49,20 @@ def demo(
 ) -> None:
     """A mapping flight and an inspection through a built-in mine, from raw recording to accuracy report."""
     from mineloc.survey.demo import write_demo
+    from mineloc.survey.runner import PROCESSES
 
-    _survey(write_demo(out), out, local=local, server=server, as_json=as_json, overrides=None)
+    _survey(write_demo(out), out, local=local, server=server, as_json=as_json, overrides=None, runner=PROCESSES)
 
 
 def _survey(
-    survey: Path, out: Path | None, *, local: bool, server: str | None, as_json: bool, overrides: list[str] | None
+    survey: Path,
+    out: Path | None,
+    *,
+    local: bool,
+    server: str | None,
+    as_json: bool,
+    overrides: list[str] | None,
+    runner: Runner,
 ) -> None:
     from rich.console import Console
 
@@ -46,6 +71,6 @@ def _survey(
     if local and server is not None:
         raise typer.BadParameter("either --local or --server")
     console = Console(stderr=as_json, highlight=False)
-    rows = run_survey(survey, console, out=out, overrides=overrides or (), local=local, server=server)
+    rows = run_survey(survey, console, out=out, overrides=overrides or (), local=local, server=server, runner=runner)
     if as_json:
         write_json(rows)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack
@@ -56,6 +57,32 @@ def open_recording(path: Path) -> Recording:
         expected=_EXPECTED,
         todo="check the path, or copy it again",
     )
+
+
+def has_end(path: Path) -> bool:
+    """Whether what is read last is there, without reading the rest: False of an MCAP file that is still being copied.
+
+    Other kinds do not tell; they count as ended.
+
+    Raises:
+        IngestError: it cannot be read.
+    """
+    parts = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+    try:
+        return all(_has_end(part) for part in parts)
+    except OSError as error:
+        raise IngestError(
+            path, f"cannot be read ({error.strerror})", todo="check its permissions and the disk"
+        ) from error
+
+
+def _has_end(path: Path) -> bool:
+    with path.open("rb") as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            return True
+        file.seek(0, os.SEEK_END)
+        file.seek(max(file.tell() - len(MAGIC), 0))
+        return file.read() == MAGIC and file.tell() > 2 * len(MAGIC)
 
 
 def _open_folder(path: Path) -> Recording:

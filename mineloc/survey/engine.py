@@ -15,7 +15,8 @@ from mineloc.output import one_line_errors
 from mineloc.store.store import Outcome, Store
 from mineloc.survey.events import Event, Listener
 from mineloc.survey.plan import Plan, Step
-from mineloc.survey.pool import Pool, StoppedError
+from mineloc.survey.pool import StoppedError
+from mineloc.survey.runner import PROCESSES, Runner, Workers
 
 
 class Engine:
@@ -24,14 +25,14 @@ class Engine:
     Args:
         plan: what there is to do.
         store: where results are kept.
-        pool: where stages run.
+        workers: where stages run.
         listener: hears of everything; called from the thread that runs the step.
     """
 
-    def __init__(self, plan: Plan, store: Store, pool: Pool, listener: Listener) -> None:
+    def __init__(self, plan: Plan, store: Store, workers: Workers, listener: Listener) -> None:
         self.plan = plan
         self._store = store
-        self._pool = pool
+        self._workers = workers
         self._listener = listener
 
     def is_known(self, step: Step, made: Mapping[str, Outcome]) -> bool:
@@ -64,7 +65,7 @@ class Engine:
         known = job.lookup(self._store)
         if known is not None:
             return known
-        return self._pool.run(
+        return self._workers.run(
             job,
             self._store.root,
             progress=lambda done, total, unit: self._listener(Event(step.name, "progress", done, total, unit)),
@@ -73,10 +74,14 @@ class Engine:
 
 
 @contextmanager
-def engine(plan: Plan, listener: Listener) -> Generator[Engine]:
+def engine(plan: Plan, listener: Listener, runner: Runner = PROCESSES) -> Generator[Engine]:
     """An engine that works in the survey's folder, which nobody else may meanwhile.
 
+    Args:
+        runner: on which workers.
+
     Raises:
+        SurveyError: there are no such workers.
         OutputError: the folder cannot be written, or another survey is at work in it.
     """
     logs = plan.state / "logs"
@@ -86,8 +91,8 @@ def engine(plan: Plan, listener: Listener) -> Generator[Engine]:
         store = Store(plan.state / "store")
         store.sweep()
         try:
-            with Pool(min(plan.workers, len(plan.runs)), logs / "stages.log") as pool:
-                yield Engine(plan, store, pool, listener)
+            with runner.workers(min(plan.workers, len(plan.runs)), logs / "stages.log") as workers:
+                yield Engine(plan, store, workers, listener)
         finally:
             store.sweep()
 

@@ -23,17 +23,25 @@ from mineloc.errors import MinelocError, SurveyError
 from mineloc.output import one_line_errors
 from mineloc.survey.events import Event, Listener
 from mineloc.survey.plan import Plan
+from mineloc.survey.runner import Runner
 
 STOP_S = 15.0
 
 
 def run_flow(
-    survey: Path, plan: Plan, listener: Listener, *, overrides: Sequence[str] = (), server: str | None = None
+    survey: Path,
+    plan: Plan,
+    listener: Listener,
+    runner: Runner,
+    *,
+    overrides: Sequence[str] = (),
+    server: str | None = None,
 ) -> None:
     """Run a survey's flow.
 
     Args:
         survey: the survey file; `plan` is its plan.
+        runner: which workers.
         overrides: `section.key=value`.
         server: address of a running Prefect server; None starts one for this run alone.
 
@@ -46,7 +54,7 @@ def run_flow(
         log.parent.mkdir(parents=True, exist_ok=True)
         listening, telling = os.pipe()
         command = [sys.executable, "-P", "-m", "flows", str(survey.absolute()), "--out", str(plan.out.absolute())]
-        command += [f"--set={text}" for text in overrides]
+        command += [*runner.words(), *(f"--set={text}" for text in overrides)]
         command += [f"--events={telling}", *([f"--server={server}"] if server else [])]
         with log.open("wb") as sink:
             process = subprocess.Popen(

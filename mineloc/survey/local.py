@@ -9,9 +9,10 @@ from mineloc.store.store import Outcome
 from mineloc.survey.engine import engine
 from mineloc.survey.events import Listener
 from mineloc.survey.plan import Plan, Step
+from mineloc.survey.runner import PROCESSES, Runner
 
 
-def run_local(plan: Plan, listener: Listener) -> dict[str, Outcome]:
+def run_local(plan: Plan, listener: Listener, runner: Runner = PROCESSES) -> dict[str, Outcome]:
     """Run all steps; the outcomes by step name.
 
     Raises:
@@ -21,8 +22,9 @@ def run_local(plan: Plan, listener: Listener) -> dict[str, Outcome]:
     errors: list[MinelocError] = []
     left = list(plan.steps)
     running: dict[Future[Outcome], Step] = {}
-    # A thread waits for a process; the pool of processes is closed first, so that no thread waits for ever.
-    with ThreadPoolExecutor(max_workers=plan.workers + 1) as threads, engine(plan, listener) as work:
+    # A thread waits for a process; the workers are closed first, so that no thread waits for ever.
+    at_once = runner.at_once(plan.workers) + 1
+    with ThreadPoolExecutor(max_workers=at_once) as threads, engine(plan, listener, runner) as work:
         while True:
             for step in [step for step in left if all(name in made for name in step.needs())]:
                 left.remove(step)

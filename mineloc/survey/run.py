@@ -12,6 +12,7 @@ from mineloc.store.store import Store
 from mineloc.survey.flow_process import run_flow
 from mineloc.survey.local import run_local
 from mineloc.survey.plan import Plan, plan_survey
+from mineloc.survey.runner import PROCESSES, Runner
 from mineloc.survey.screen import Screen, paths, summary_table
 from mineloc.survey.spec import Survey, read_survey
 from mineloc.survey.summary import summary
@@ -25,6 +26,7 @@ def run_survey(
     overrides: Sequence[str] = (),
     local: bool = False,
     server: str | None = None,
+    runner: Runner = PROCESSES,
 ) -> list[dict[str, Any]]:
     """Run what a survey file says; the figures of its runs.
 
@@ -34,6 +36,7 @@ def run_survey(
         overrides: `section.key=value`.
         local: without Prefect.
         server: a running Prefect server; None starts one for this run.
+        runner: which workers; processes of this machine by default.
 
     Raises:
         MinelocError: the file is wrong, or of the first step that failed, when all that does not need it is done.
@@ -44,11 +47,11 @@ def run_survey(
         _refuse_unknown_methods(survey)
     with Screen(console, len(plan.steps)) as screen:
         if local:
-            run_local(plan, screen)
+            run_local(plan, screen, runner)
         else:
             screen.note(f"[dim]Prefect flow, {f'at {server}' if server else 'with a server of its own'}[/]")
             try:
-                run_flow(path, plan, screen, overrides=overrides, server=server)
+                run_flow(path, plan, screen, runner, overrides=overrides, server=server)
             finally:
                 _sweep(plan)
     rows = summary(plan)
