@@ -56,6 +56,16 @@ def _prefer_openmp() -> None:
         numba.config.THREADING_LAYER_PRIORITY = layers  # pyright: ignore[reportAttributeAccessIssue, reportPrivateImportUsage]
 
 
+def _wait_asleep() -> None:
+    """OpenMP's threads wait for each other by spinning; where anything else wants a core, they spin most of the time.
+
+    Beside two other busy processes on two cores, odometry that waits asleep is twice as fast and takes a quarter of the
+    CPU time; alone it is as fast. OpenMP reads this when its first parallel loop begins.
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+
 _use_own_cache()
 _prefer_openmp()
+_wait_asleep()
 njit = numba.njit
