@@ -21,7 +21,7 @@ import numpy as np
 from edgar_map import MESH, mineloc
 from paper_a import simulated, start_of
 
-from mineloc.sim.mine import load_mine
+from mineloc.sim.mine import Mine, load_mine
 
 ROOT = Path(__file__).resolve().parents[1]
 MESHES = MESH.parents[1]
@@ -29,6 +29,8 @@ MAPPING_M = {"gm_kum": 2400.0, "tunnel_qual": 3500.0, "edgar_stix": 2400.0}
 """Of the mapping flights through meshes that nothing was tuned on: enough to see what the other flight passes."""
 CASES = (*MAPPING_M, "changed", "shifted", *(f"{mesh}_in_edgar" for mesh in (*MAPPING_M, "straight")))
 MAPPING_SEED, SEED, CHANGED_SEED = 221, 321, 331
+WIDENED_M = 8.0
+"""Radius within which walls give way."""
 COLUMNS = (
     "case", "start", "length m", "accepted", "wrong", "precision %", "passages", "recall %", "RMSE m", "max m",
     "online max m", "found after m", "what was told most",
@@ -107,9 +109,17 @@ def most_told(run: Path) -> str:
     return f"{reasons['reason'][0]} ({reasons['count'][0]} times)" if len(reasons) else "no junction was seen"
 
 
+def _wall_m(mine: Mine, place_m: np.ndarray) -> float:
+    """How far the nearest wall is; where the mine is open to the sky, none may be near."""
+    bearings = np.radians(np.arange(0.0, 360.0, 2.0))
+    around = np.stack([np.cos(bearings), np.sin(bearings), np.zeros(len(bearings))], axis=1)
+    return float(mine.scene.ranges_m(np.broadcast_to(place_m, around.shape), around).min())
+
+
 def changes(mesh: Path, *, every: int = 3) -> dict[str, str]:
     """A third of the intersections walled up on one side, another third widened by a metre."""
-    graph = load_mine(mesh).graph
+    mine = load_mine(mesh)
+    graph = mine.graph
     closed: list[list[float]] = []
     widened: list[list[float]] = []
     at_node, above = graph.at_node(), np.array([0.0, 0.0, 1.2])
@@ -124,8 +134,8 @@ def changes(mesh: Path, *, every: int = 3) -> dict[str, str]:
             here, ahead = (np.array([np.interp(m, way, axis) for axis in line.T]) for m in (4.0, 5.0))
             bearing = float(np.degrees(np.arctan2(*(ahead - here)[1::-1])))
             closed.append([*np.round(here + above, 2).tolist(), round(bearing, 1)])
-        elif k % every == 1:
-            widened.append([*np.round(place + above, 2).tolist(), 8.0, 1.0])
+        elif k % every == 1 and _wall_m(mine, place + above) < WIDENED_M:
+            widened.append([*np.round(place + above, 2).tolist(), WIDENED_M, 1.0])
     return {"closed": json.dumps(closed), "widened": json.dumps(widened)}
 
 
