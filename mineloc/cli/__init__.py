@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import sys
 
+from mineloc.cli import dataset_files as dataset_files
+from mineloc.cli import datasets as datasets
 from mineloc.cli import flights as flights
 from mineloc.cli import maps as maps
 from mineloc.cli import runs as runs

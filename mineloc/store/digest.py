@@ -17,6 +17,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TypeAlias
 
+from mineloc.errors import StoreError
+
 Json: TypeAlias = Mapping[str, "Json"] | Sequence["Json"] | str | int | float | bool | None
 
 BLOCK_BYTES = 1 << 20
@@ -39,6 +41,23 @@ def canonical_json(value: Json) -> str:
 def sha256_of_text(text: str) -> str:
     """Hex sha256 of UTF-8 text."""
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def is_digest(text: object) -> bool:
+    """Whether something is written like a hex sha256."""
+    return isinstance(text, str) and len(text) == 64 and not text.strip("0123456789abcdef")
+
+
+def sealed(body: str) -> str:
+    """One line of text under the line of its own sha256, so that damage to either is seen."""
+    return f"{sha256_of_text(body)}\n{body}\n"
+
+
+def unsealed(text: str) -> str | None:
+    """The text under a seal, None if it is damaged."""
+    digest, _, body = text.partition("\n")
+    body = body.removesuffix("\n")
+    return body if text == f"{digest}\n{body}\n" and sha256_of_text(body) == digest else None
 
 
 def sha256_of_file(path: Path) -> str:
@@ -88,6 +107,21 @@ class DigestIndex:
         except (OSError, ValueError, TypeError):
             return None
         return digest if signature == _signature(path) else None
+
+    def copy(self, source: Path, target: Path) -> str:
+        """Copy a file and return the sha256 of what was copied; the source is then known too.
+
+        Raises:
+            StoreError: the source changed while it was copied.
+            OSError: it cannot be read, or the copy not be written.
+        """
+        before = _signature(source)
+        digest = copy_and_hash(source, target)
+        if _signature(source) != before:
+            raise StoreError(source, "changed while it was copied", todo="run again when it is complete")
+        if time.time_ns() - before[-1] > SETTLE_NS:
+            self._write(source, before, digest)
+        return digest
 
     def remember(self, path: Path, digest: str) -> None:
         """Note the sha256 of a file that only the caller can have written."""

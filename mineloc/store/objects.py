@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import hashlib
 import json
 import os
 import shutil
@@ -19,7 +20,7 @@ from typing import Literal
 
 from mineloc.errors import OutputError, StoreError
 from mineloc.output import TEMP_PREFIX, fsync_path, new_folder, one_line_errors
-from mineloc.store.digest import DigestIndex, canonical_json, copy_and_hash, sha256_of_file
+from mineloc.store.digest import DigestIndex, Json, canonical_json, is_digest, sha256_of_file
 
 READ_ONLY = 0o444
 _FICLONE = 0x40049409  # Linux: share the blocks of another file until one of the two is written
@@ -70,20 +71,21 @@ class Objects:
                 return Ref(self._commit(path, sha256_of_file(path)), "file", size)
             return self._adopt_folder(path, volatile)
 
-    def copy(self, path: Path, workspace: Path) -> Ref:
-        """Bring a file that stays where it is into the store, hashed while it is copied.
+    def commit(self, files: Mapping[str, Path]) -> None:
+        """Move files, hashed while they were written on the same file system, into the store; in the order given.
+
+        Args:
+            files: by sha256.
 
         Raises:
             OutputError: the disk is full, or fails.
         """
         with one_line_errors(self._folder):
-            temp = workspace / path.name
-            digest = copy_and_hash(path, temp)
-            size = temp.stat().st_size
-            return Ref(self._commit(temp, digest), "file", size)
+            for digest, temp in files.items():
+                self._commit(temp, digest)
 
     def _adopt_folder(self, folder: Path, volatile: Collection[str]) -> Ref:
-        files: dict[str, dict[str, str | int]] = {}
+        files: dict[str, tuple[str, int]] = {}
         apart: dict[str, str] = {}
         total = 0
         for name, file in files_below(folder).items():
@@ -92,10 +94,10 @@ class Objects:
             if name in volatile:
                 apart[name] = digest
             else:
-                files[name] = {"bytes": size, "sha256": digest}
+                files[name] = (digest, size)
                 total += size
         tree = folder.with_name(folder.name + ".tree")
-        tree.write_text(canonical_json({"files": files, "tree": 1}))
+        tree.write_text(tree_text(files))
         return Ref(self._commit(tree, sha256_of_file(tree)), "folder", total, apart)
 
     def _commit(self, temp: Path, digest: str) -> str:
@@ -119,11 +121,9 @@ class Objects:
         """
         if ref.kind == "file":
             return {"": ref.digest}
-        try:
-            tree = json.loads(self._read(ref.digest))
-            return {name: str(entry["sha256"]) for name, entry in tree["files"].items()} | dict(ref.volatile)
-        except (ValueError, KeyError, TypeError, AttributeError):
-            raise _damaged(self.path(ref.digest), "not a tree") from None
+        if not all(_is_inside(name) for name in ref.volatile):
+            raise _damaged(self.path(ref.digest), "files outside of its folder")
+        return tree_files(self.read_text(ref.digest), self.path(ref.digest)) | dict(ref.volatile)
 
     def damage(self, ref: Ref) -> list[str]:
         """The objects of a ref that are gone or are not what their name says, as far as the file system tells."""
@@ -219,11 +219,48 @@ class Objects:
         self._index.remember(source, digest)
         self._index.remember(to, digest)
 
-    def _read(self, digest: str) -> str:
+    def read_text(self, digest: str) -> str:
+        """A small object as text (a tree, a manifest), checked by its hash.
+
+        Raises:
+            StoreError: it is gone or damaged.
+        """
         try:
-            return self.path(digest).read_text()
+            content = self.path(digest).read_bytes()
+            if hashlib.sha256(content).hexdigest() == digest:
+                return content.decode()
         except (OSError, UnicodeDecodeError):
-            raise _damaged(self.path(digest), "gone or damaged") from None
+            pass
+        raise _damaged(self.path(digest), "gone or damaged")
+
+
+def tree_text(files: Mapping[str, tuple[str, int]]) -> str:
+    """The tree of a folder: its sha256 is the folder's name.
+
+    Args:
+        files: sha256 and size, by path relative to the folder (with `/`).
+    """
+    entries: dict[str, Json] = {name: {"bytes": size, "sha256": sha} for name, (sha, size) in files.items()}
+    return canonical_json({"files": entries, "tree": 1})
+
+
+def tree_files(text: str, where: Path) -> dict[str, str]:
+    """The sha256 of every file of a tree, by path.
+
+    Raises:
+        StoreError: it is no tree, or leads out of its folder.
+    """
+    try:
+        files = {str(name): str(entry["sha256"]) for name, entry in json.loads(text)["files"].items()}
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise _damaged(where, "not a tree") from None
+    if any(not _is_inside(name) or not is_digest(digest) for name, digest in files.items()):
+        raise _damaged(where, "not a tree")
+    return files
+
+
+def _is_inside(name: str) -> bool:
+    return all(part not in ("", ".", "..") for part in name.split("/")) and "\0" not in name
 
 
 def files_below(folder: Path) -> dict[str, Path]:

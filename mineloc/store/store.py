@@ -14,9 +14,11 @@ from pathlib import Path
 
 from mineloc.errors import StoreError
 from mineloc.output import TEMP_PREFIX, new_file, one_line_errors
-from mineloc.store.digest import DigestIndex, canonical_json, sha256_of_text
-from mineloc.store.objects import Objects, Ref, files_below
+from mineloc.store.digest import DigestIndex, sha256_of_text
+from mineloc.store.gate import Gate
+from mineloc.store.objects import Objects, Ref, files_below, tree_text
 from mineloc.store.record import Action, Record, Records, read_record
+from mineloc.store.staging import stage
 from mineloc.store.workspace import Workspaces
 
 LAYOUT = "mineloc store 1\n"
@@ -45,16 +47,18 @@ class Findings:
         damaged: objects that are not what their name says.
         missing: objects that an intact record or tree names and that are not there.
         records: record files that are damaged.
+        refs: references that are damaged, `<dataset>/latest` or `<dataset>/tags/<tag>`.
     """
 
     damaged: tuple[str, ...]
     missing: tuple[str, ...]
     records: tuple[Path, ...]
+    refs: tuple[str, ...] = ()
 
     @property
     def is_sound(self) -> bool:
         """Whether nothing was found."""
-        return not (self.damaged or self.missing or self.records)
+        return not (self.damaged or self.missing or self.records or self.refs)
 
 
 class Store:
@@ -70,7 +74,8 @@ class Store:
         self.index = DigestIndex(root / "index")
         self.objects = Objects(root, self.index)
         self.records = Records(root)
-        self._workspaces = Workspaces(root)
+        self.workspaces = Workspaces(root)
+        self.gate = Gate(root)
         self._open()
 
     def _open(self) -> None:
@@ -78,7 +83,9 @@ class Store:
         with one_line_errors(self.root):
             if not mark.exists():
                 self.root.mkdir(parents=True, exist_ok=True)
-                if any(not p.name.startswith((TEMP_PREFIX, mark.name)) for p in self.root.iterdir()):
+                others = any(not p.name.startswith((TEMP_PREFIX, mark.name)) for p in self.root.iterdir())
+                # Asked again: another process may have made the store just now.
+                if others and not mark.exists():
                     raise StoreError(self.root, "a folder that is not a store", todo="choose an empty folder")
                 with new_file(mark, overwrite=True) as temp:
                     temp.write_text(LAYOUT)
@@ -108,7 +115,7 @@ class Store:
         known = self.lookup(action)
         if known is not None:
             return known
-        with self._workspaces.hold(action.key, waiting=waiting) as workspace:
+        with self.workspaces.hold(action.key, waiting=waiting) as workspace:
             known = self.lookup(action)
             if known is not None:
                 return known
@@ -117,8 +124,9 @@ class Store:
             with one_line_errors(self.root):
                 output = execute(workspace)
             seconds = time.perf_counter() - start
-            ref = self.objects.adopt(output, volatile=volatile)
-            record = self.records.write(action, ref, seconds, workspace=workspace)
+            with self.gate.adding():
+                ref = self.objects.adopt(output, volatile=volatile)
+                record = self.records.write(action, ref, seconds, workspace=workspace)
         return Outcome(ref, hit=False, seconds=record.seconds)
 
     def lookup(self, action: Action) -> Outcome | None:
@@ -141,13 +149,17 @@ class Store:
             self.objects.discard(digest)
 
     def add(self, path: Path) -> Ref:
-        """Bring a copy of a file into the store.
+        """Bring a copy of a file or folder into the store; nothing keeps it there but its youth.
 
         Raises:
+            StoreError: it cannot be read, or changed meanwhile.
             OutputError: the store cannot be written.
         """
-        with self._workspaces.hold(f"add-{sha256_of_text(str(path.absolute()))}") as workspace:
-            return self.objects.copy(path, workspace)
+        with self.workspaces.hold(f"add-{sha256_of_text(str(path.absolute()))}") as workspace:
+            staged = stage(path, workspace / "staged", self.index)
+            with self.gate.adding():
+                self.objects.commit(staged.files)
+        return staged.ref
 
     def source(self, path: Path) -> Ref:
         """The content of a file or folder outside, which stays there; unchanged files are not read again.
@@ -157,9 +169,8 @@ class Store:
         """
         try:
             if path.is_dir():
-                files = {name: self.index.digest(file) for name, file in files_below(path).items()}
-                size = sum(file.stat().st_size for file in files_below(path).values())
-                return Ref(sha256_of_text(canonical_json(files)), "folder", size)
+                files = {name: (self.index.digest(f), f.stat().st_size) for name, f in files_below(path).items()}
+                return Ref(sha256_of_text(tree_text(files)), "folder", sum(size for _, size in files.values()))
             return Ref(self.index.digest(path), "file", path.stat().st_size)
         except OSError as error:
             raise StoreError(
@@ -188,4 +199,4 @@ class Store:
 
     def sweep(self) -> list[str]:
         """Remove the temporary folders of killed processes; those of living ones stay."""
-        return self._workspaces.sweep()
+        return self.workspaces.sweep()

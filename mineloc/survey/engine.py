@@ -88,7 +88,7 @@ def engine(plan: Plan, listener: Listener, runner: Runner = PROCESSES) -> Genera
     with one_line_errors(plan.out):
         logs.mkdir(parents=True, exist_ok=True)
     with _alone(plan):
-        store = Store(plan.state / "store")
+        store = Store(plan.store)
         store.sweep()
         try:
             with runner.workers(min(plan.workers, len(plan.runs)), logs / "stages.log") as workers:

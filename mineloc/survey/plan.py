@@ -109,12 +109,14 @@ class Plan:
     Attributes:
         out: the survey's folder.
         workers: how many steps run at the same time.
+        kept: the store, where it is not in the survey's folder.
     """
 
     out: Path
     workers: int
     steps: tuple[Step, ...]
     runs: tuple[Run, ...]
+    kept: Path | None = None
 
     def step(self, name: str) -> Step:
         """A step by name."""
@@ -126,8 +128,13 @@ class Plan:
 
     @property
     def state(self) -> Path:
-        """Where store, logs and the flows' history live."""
+        """Where logs and the flows' history live, and the store if it has no other place."""
         return self.out / ".mineloc"
+
+    @property
+    def store(self) -> Path:
+        """Where results are kept."""
+        return self.kept if self.kept is not None else self.state / "store"
 
     @property
     def report(self) -> Path:
@@ -154,7 +161,7 @@ def plan_survey(survey: Survey) -> Plan:
     localized = tuple(Made(_localize(run.flight, run.method)) for run in runs)
     title: dict[str, Json] = {"title": survey.title} if survey.title else {}
     steps.append(Step("report", "", REPORT, "report", {"runs": localized}, config=survey.config, arguments=title))
-    return Plan(survey.out, survey.workers, tuple(steps), tuple(runs))
+    return Plan(survey.out, survey.workers, tuple(steps), tuple(runs), survey.store)
 
 
 def _flight_steps(flight: Flight) -> Iterator[Step]:

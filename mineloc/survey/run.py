@@ -71,6 +71,5 @@ def _refuse_unknown_methods(survey: Survey) -> None:
 
 def _sweep(plan: Plan) -> None:
     """A flow that was stopped in the middle of a stage had no time to tidy up."""
-    store = plan.state / "store"
-    if store.exists():
-        Store(store).sweep()
+    if plan.store.exists():
+        Store(plan.store).sweep()

@@ -32,6 +32,10 @@ flights = ["north"]
 control = "survey/targets.csv"      # surveyed targets, and where flights saw them; else what the flights bring
 observations = "survey/seen.csv"
 intersections = true                # also make the database of its intersections
+
+Before the first table, `dataset = "level4@2026-11"` adds every flight of that version of a dataset, with its recording
+from the store (`store = "..."` beside the file, else the one that all commands take); a `[[flight]]` of the same name
+then only refines it. The results are kept in that store too.
 """
 
 from __future__ import annotations
@@ -46,9 +50,9 @@ from pydantic import Field
 
 from mineloc.config import Config, Section, layered_config, read_toml, validate
 from mineloc.errors import ConfigError
+from mineloc.store.versions import NAME
+from mineloc.survey.dataset_flights import DatasetFlights, dataset_flights
 from mineloc.survey.methods import KNOW_A_MAP
-
-NAME = r"[A-Za-z0-9][A-Za-z0-9._-]*"
 
 
 class FlightSpec(Section):
@@ -84,7 +88,9 @@ class SurveySpec(Section):
     methods: tuple[str, ...] = Field(default=("odometry",), min_length=1)
     workers: int = Field(default=2, ge=1, le=64, description="processes at work at the same time")
     config: dict[str, Any] = Field(default_factory=dict)
-    flight: tuple[FlightSpec, ...] = Field(min_length=1)
+    dataset: str | None = Field(default=None, description="a version of one, whose flights are flown too")
+    store: str | None = Field(default=None, description="where the dataset is kept")
+    flight: tuple[FlightSpec, ...] = ()
     map: tuple[MapSpec, ...] = ()
 
 
@@ -138,6 +144,7 @@ class Survey:
         out: the folder for the results.
         methods: of flights that name none of their own.
         config: what holds for the survey as a whole (the report).
+        store: of its dataset, where results are kept too; None: in its own folder.
     """
 
     path: Path
@@ -148,6 +155,7 @@ class Survey:
     flights: tuple[Flight, ...]
     config: Config
     maps: tuple[Map, ...] = ()
+    store: Path | None = None
 
     def methods_of(self, flight: Flight) -> tuple[str, ...]:
         """By which a flight is localized, each once."""
@@ -162,10 +170,17 @@ def read_survey(path: Path, overrides: Iterable[str] = (), *, out: Path | None =
         out: where the results go, over the file's own word.
 
     Raises:
-        ConfigError: not TOML, an unknown key, a value that does not fit, a file that does not exist, two flights of
-            one name, a method that needs a map on a flight that has none or is part of it.
+        ConfigError: not TOML, an unknown key, no such dataset, a value that does not fit, a file that does not exist,
+            two flights of one name, a method that needs a map on a flight that has none or is part of it.
     """
     spec = validate(SurveySpec, read_toml(path), where=str(path))
+    known = None if spec.dataset is None else dataset_flights(path, spec.dataset, spec.store)
+    if known is not None:
+        spec = _with_dataset(path, spec, known)
+    elif spec.store is not None:
+        raise ConfigError(path, "a store without a dataset", expected='dataset = "name@tag"', todo="add it")
+    if not spec.flight:
+        raise ConfigError(path, "no flight", expected="a [[flight]], or a dataset with one", todo="add it")
     overrides = list(overrides)
     _refuse_equal_names(path, "flights", [flight.name for flight in spec.flight])
     _refuse_equal_names(path, "maps", [one.name for one in spec.map])
@@ -179,9 +194,28 @@ def read_survey(path: Path, overrides: Iterable[str] = (), *, out: Path | None =
         flights=flights,
         config=layered_config([spec.config], overrides, where=str(path)),
         maps=tuple(_map(path, one, flights) for one in spec.map),
+        store=None if known is None else known.store,
     )
     _refuse_unmapped(survey)
     return survey
+
+
+def _with_dataset(path: Path, spec: SurveySpec, known: DatasetFlights) -> SurveySpec:
+    """The flights of the dataset, each as the file refines it, before those that the file alone names."""
+    told = {flight.name: flight for flight in spec.flight}
+    flights: list[FlightSpec] = []
+    for name, (recording, sequence) in known.files.items():
+        flight = told.pop(name, FlightSpec(name=name))
+        if any(one is not None for one in (flight.recording, flight.mine, flight.graph, flight.sequence)):
+            raise ConfigError(
+                f"{path}: flight {name}",
+                f"its recording comes from dataset {spec.dataset!r}",
+                expected="methods, map, config or reference only",
+                todo="rename the flight, or take recording, sequence, mine and graph away",
+            )
+        written = {"recording": str(recording), "sequence": None if sequence is None else str(sequence)}
+        flights.append(flight.model_copy(update=written))
+    return spec.model_copy(update={"flight": (*flights, *told.values())})
 
 
 def slug(name: str) -> str:

@@ -2,12 +2,14 @@
 
 import os
 import stat
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from mineloc.errors import OutputError, StoreError
 from mineloc.store.digest import SETTLE_NS, DigestIndex
+from mineloc.store.objects import tree_text
 from mineloc.store.record import Action
 from mineloc.store.store import Store
 
@@ -194,6 +196,23 @@ def test_stages_read_links_that_lead_to_the_content(store, tmp_path):
     ref = store.run(ACTION, Work(a=b"1", b=b"2")).output
     store.objects.expose(ref, tmp_path / "in" / "run")
     assert (tmp_path / "in" / "run" / "b").read_bytes() == b"2"
+
+
+@pytest.mark.parametrize("name", ["../x", "/proc/x", "a/../../x", "a//x", ".", "", "a\0"])
+def test_a_tree_that_leads_out_of_its_folder_is_refused(store, tmp_path, name):
+    """Trees come from others too: imported, pulled."""
+    (tmp_path / "f").write_bytes(b"1")
+    inside = store.add(tmp_path / "f").digest
+    (tmp_path / "tree").write_text(tree_text({name: (inside, 1)}))
+    forged = replace(store.add(tmp_path / "tree"), kind="folder")
+    with pytest.raises(StoreError, match="not a tree"):
+        store.place(forged, tmp_path / "there" / "deep")
+    (tmp_path / "tree").write_text(tree_text({"a": (inside, 1)}))
+    fine = replace(store.add(tmp_path / "tree"), kind="folder")
+    with pytest.raises(StoreError, match="outside of its folder"):
+        store.place(replace(fine, volatile={name: inside}), tmp_path / "there" / "deep")
+    assert not (tmp_path / "there").exists()
+    store.place(fine, tmp_path / "there" / "deep")
 
 
 def test_an_added_file_is_there_and_the_source_untouched(store, tmp_path):
