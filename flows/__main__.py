@@ -12,8 +12,7 @@ import threading
 import traceback
 from pathlib import Path
 
-from flows.server import own_server
-from flows.settings import answering, settings
+from flows.server import prefect_api
 from mineloc.errors import MinelocError, SurveyError
 from mineloc.survey.flow_process import error_to_line
 
@@ -44,15 +43,9 @@ def main() -> int:
 
 
 def _run(given: argparse.Namespace) -> None:
-    os.environ.update(settings(None if given.server else given.out / ".mineloc" / "prefect"))
-    if given.server:
-        os.environ["PREFECT_API_URL"] = answering(given.server)
-        _flow(given)
-        return
-    with own_server(given.out / ".mineloc" / "prefect") as ready:
-        os.environ["PREFECT_API_URL"] = ready.address
+    with prefect_api(given.server, given.out / ".mineloc" / "prefect") as wait:
         importlib.import_module("flows.survey")  # takes seconds, as the server does: both at once
-        ready.wait()
+        wait()
         _flow(given)
 
 

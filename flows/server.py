@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
+import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from flows.settings import START_S, answers
+from flows.settings import START_S, answering, answers, settings
 from mineloc.errors import SurveyError
 
 STOP_S = 5.0
+_PR_SET_PDEATHSIG = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +42,25 @@ class Starting:
 
 
 @contextmanager
+def prefect_api(server: str | None, home: Path) -> Generator[Callable[[], None]]:
+    """Within: the environment names a server, the one at that address or one of our own with its history in `home`.
+
+    Yields what waits until it answers; import what needs prefect within, for settings count at its import.
+
+    Raises:
+        SurveyError: nobody answers at the address.
+    """
+    os.environ.update(settings(None if server else home))
+    if server:
+        os.environ["PREFECT_API_URL"] = answering(server)
+        yield lambda: None
+        return
+    with own_server(home) as ready:
+        os.environ["PREFECT_API_URL"] = ready.address
+        yield ready.wait
+
+
+@contextmanager
 def own_server(home: Path) -> Generator[Starting]:
     """A server on a free port of this machine alone, with its history in `home`; ends with the block."""
     home.mkdir(parents=True, exist_ok=True)
@@ -53,6 +75,7 @@ def own_server(home: Path) -> Generator[Starting]:
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
+            preexec_fn=end_with_parent,
         )
     try:
         yield Starting(address, process)
@@ -63,3 +86,8 @@ def own_server(home: Path) -> Generator[Starting]:
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
+
+
+def end_with_parent() -> None:
+    """In a new process: when its parent is killed, so is it (Linux); a second server on one history would lock it."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -34,6 +34,7 @@ def survey(
     events: int | None = None,
     runner: str = "process",
     address: str | None = None,
+    patient: bool = False,
 ) -> None:
     """Run a survey file.
 
@@ -42,6 +43,7 @@ def survey(
         overrides: `section.key=value`.
         events: file descriptor that takes events as lines of JSON.
         runner, address: which workers: "process", or "dask" and where its scheduler is.
+        patient: wait for another run in the folder, left behind by a service that was killed.
 
     Raises:
         MinelocError: of the first step that failed, after everything that does not need it is done.
@@ -53,7 +55,7 @@ def survey(
 
     plan = plan_survey(read_survey(Path(path), overrides or (), out=Path(out)))
     futures: dict[str, PrefectFuture[Any]] = {}
-    with engine(plan, tell, Runner.named(runner, address)) as work:
+    with engine(plan, tell, Runner.named(runner, address), patient=patient) as work:
         for step in plan.steps:
             made = {name: futures[name] for name in step.needs()}
             futures[step.name] = TASKS[step.stage.name].submit(work, opaque(step), made)

@@ -41,6 +41,31 @@ def run(
 
 
 @app.command()
+def serve(
+    survey: Annotated[Path, typer.Argument(help="survey.toml; with --watch it names a dataset.")],
+    out: Annotated[Path | None, typer.Option("--out", help="Folder of the results, over the file's own word.")] = None,
+    cron: Annotated[str | None, typer.Option("--cron", help="When it runs: five fields, '0 2 * * *' at two.")] = None,
+    timezone: Annotated[str, typer.Option("--timezone", help="In which the fields are meant.")] = "UTC",
+    watch: Annotated[Path | None, typer.Option("--watch", help="Inbox: what lands is added and processed.")] = None,
+    every_s: Annotated[float, typer.Option("--every-s", help="The inbox is looked at so often.", min=0.1)] = 10.0,
+    settle_s: Annotated[float, typer.Option("--settle-s", help="A recording that stood still so long.", min=0)] = 10.0,
+    server: ServerOption = None,
+    runner: RunnerOption = "process",
+    address: AddressOption = None,
+) -> None:
+    """Reprocess a survey for good, at set times or when recordings land. E.g. serve mine.toml --watch INBOX/."""
+    from mineloc.survey.serving import become_service
+
+    if cron is None and watch is None:
+        raise typer.BadParameter("--cron, --watch or both")
+    words = {
+        "cron": cron, "timezone": timezone, "watch": watch, "every-s": every_s, "settle-s": settle_s,
+        "server": server, "runner": runner, "address": address,
+    }  # fmt: skip
+    become_service(survey, out, words)
+
+
+@app.command()
 def demo(
     out: Annotated[Path, typer.Option("--out", help="Folder of the results.")] = Path("demo"),
     local: LocalOption = False,

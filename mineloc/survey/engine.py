@@ -74,11 +74,12 @@ class Engine:
 
 
 @contextmanager
-def engine(plan: Plan, listener: Listener, runner: Runner = PROCESSES) -> Generator[Engine]:
+def engine(plan: Plan, listener: Listener, runner: Runner = PROCESSES, *, patient: bool = False) -> Generator[Engine]:
     """An engine that works in the survey's folder, which nobody else may meanwhile.
 
     Args:
         runner: on which workers.
+        patient: wait until a run that is at work in the folder is done.
 
     Raises:
         SurveyError: there are no such workers.
@@ -87,7 +88,7 @@ def engine(plan: Plan, listener: Listener, runner: Runner = PROCESSES) -> Genera
     logs = plan.state / "logs"
     with one_line_errors(plan.out):
         logs.mkdir(parents=True, exist_ok=True)
-    with _alone(plan):
+    with _alone(plan, patient=patient):
         store = Store(plan.store)
         store.sweep()
         try:
@@ -98,10 +99,10 @@ def engine(plan: Plan, listener: Listener, runner: Runner = PROCESSES) -> Genera
 
 
 @contextmanager
-def _alone(plan: Plan) -> Generator[None]:
+def _alone(plan: Plan, *, patient: bool) -> Generator[None]:
     lock = FileLock(plan.state / "lock")
     try:
-        lock.acquire(timeout=0)
+        lock.acquire(timeout=-1 if patient else 0)
     except Timeout:
         raise OutputError(
             plan.out, "another run is at work here", todo="wait until it is done or choose another --out"

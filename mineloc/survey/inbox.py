@@ -95,6 +95,10 @@ class Inbox:
                     found.append(Landed(path, flight_name(path)))
         return found
 
+    def put_back(self, landed: Landed) -> None:
+        """A recording that could not be used just now is told again."""
+        self._taken.pop(landed.path, None)
+
     def _is_complete(self, path: Path, still_s: float) -> bool:
         """Whether it is time to take it; what is no recording is taken too, and refused."""
         if still_s < self._settle_s:

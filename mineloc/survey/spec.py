@@ -173,7 +173,7 @@ def read_survey(path: Path, overrides: Iterable[str] = (), *, out: Path | None =
         ConfigError: not TOML, an unknown key, no such dataset, a value that does not fit, a file that does not exist,
             two flights of one name, a method that needs a map on a flight that has none or is part of it.
     """
-    spec = validate(SurveySpec, read_toml(path), where=str(path))
+    spec = read_spec(path)
     known = None if spec.dataset is None else dataset_flights(path, spec.dataset, spec.store)
     if known is not None:
         spec = _with_dataset(path, spec, known)
@@ -188,7 +188,7 @@ def read_survey(path: Path, overrides: Iterable[str] = (), *, out: Path | None =
     survey = Survey(
         path=path,
         title=spec.title,
-        out=out if out is not None else path.parent / (spec.out or f"{path.stem}.results"),
+        out=_out(path, spec, out),
         methods=tuple(dict.fromkeys(spec.methods)),
         workers=spec.workers,
         flights=flights,
@@ -198,6 +198,31 @@ def read_survey(path: Path, overrides: Iterable[str] = (), *, out: Path | None =
     )
     _refuse_unmapped(survey)
     return survey
+
+
+def read_spec(path: Path) -> SurveySpec:
+    """A survey file as it is written; whether what it names exists is not looked at.
+
+    Raises:
+        ConfigError: not TOML, an unknown key, or a value that does not fit.
+    """
+    return validate(SurveySpec, read_toml(path), where=str(path))
+
+
+def out_of(path: Path, out: Path | None) -> Path:
+    """The folder for the results of a survey file.
+
+    Args:
+        out: over the file's own word.
+
+    Raises:
+        ConfigError: as `read_spec`.
+    """
+    return _out(path, read_spec(path), out)
+
+
+def _out(path: Path, spec: SurveySpec, out: Path | None) -> Path:
+    return out if out is not None else path.parent / (spec.out or f"{path.stem}.results")
 
 
 def _with_dataset(path: Path, spec: SurveySpec, known: DatasetFlights) -> SurveySpec:
