@@ -12,7 +12,7 @@ import threading
 import traceback
 from pathlib import Path
 
-from flows.server import prefect_api
+from flows.api import prefect_api
 from mineloc.errors import MinelocError, SurveyError
 from mineloc.survey.flow_process import error_to_line
 

@@ -1,4 +1,4 @@
-"""Scheduled reprocessing: `python -m flows.serve SURVEY.toml --out FOLDER`, which `mineloc serve` becomes.
+"""Scheduled reprocessing: `python -m flows.serve SURVEY.toml`, which `mineloc serve` becomes.
 
 A survey's flow runs at set times, and whenever recordings have landed in the inbox; one run at a time, until the
 process is told to stop. What was interrupted goes on at the next run: what is done is in the store.
@@ -10,23 +10,23 @@ import argparse
 import logging
 import os
 import sys
-import threading
+import warnings
 from pathlib import Path
-from typing import cast
 
-from flows.server import prefect_api
+from flows.api import prefect_api
+from flows.settings import settings
 from mineloc.errors import MinelocError
 from mineloc.survey.inbox import Inbox
+from mineloc.survey.runner import Runner
 from mineloc.survey.service import Service
-
-log = logging.getLogger("mineloc.serve")
+from mineloc.survey.spec import out_of
 
 
 def main() -> int:
     """Serve until told to stop."""
     parser = argparse.ArgumentParser(prog="mineloc serve")
     parser.add_argument("survey", type=Path)
-    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--out", type=Path)
     parser.add_argument("--cron")
     parser.add_argument("--timezone", default="UTC")
     parser.add_argument("--watch", type=Path)
@@ -39,54 +39,31 @@ def main() -> int:
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", stream=sys.stderr)
     logging.getLogger("httpx").setLevel(logging.WARNING)  # a line a request
     try:
-        inbox = None if given.watch is None else Inbox(given.watch, settle_s=given.settle_s)
-        service = Service(given.survey, inbox)
-        with prefect_api(given.server, given.out / ".mineloc" / "prefect") as wait:
-            wait()
-            _serve(given, service)
+        _serve(given)
     except MinelocError as error:
-        log.error("%s", error.line())
+        sys.stderr.write(f"mineloc: {error}\n")
         return 1
     return 0
 
 
-def _serve(given: argparse.Namespace, service: Service) -> None:
-    from prefect import serve
-    from prefect.deployments.runner import RunnerDeployment
-    from prefect.schedules import Cron
-    from prefect.types.entrypoint import EntrypointType
+def _serve(given: argparse.Namespace) -> None:
+    """Everything that can be wrong is looked at before anything starts or is written."""
+    inbox = None if given.watch is None else Inbox(given.watch, settle_s=given.settle_s)
+    service = Service(given.survey, inbox)
+    runner = Runner.named(given.runner, given.address)
+    out = out_of(given.survey, given.out)
+    home = out / ".mineloc" / "prefect"
+    os.environ.update(settings(None if given.server else home))  # counts at the import of prefect
+    with warnings.catch_warnings():
+        # the server makes it, if it comes to that
+        warnings.filterwarnings("ignore", "Failed to create the Prefect home")
+        from flows.deployment import Deployment
+        from flows.schedule import schedule
 
-    from flows.survey import survey
-
-    words = {"runner": given.runner, "address": given.address, "patient": True}
-    deployment = survey.to_deployment(
-        name=service.name,
-        schedules=[Cron(given.cron, timezone=given.timezone)] if given.cron else [],
-        parameters={"path": str(given.survey.absolute()), "out": str(given.out.absolute()), **words},
-        entrypoint_type=EntrypointType.MODULE_PATH,
-    )
-    log.info("serving %s at %s", given.survey, os.environ["PREFECT_API_URL"].removesuffix("/api"))
-    stop = threading.Event()
-    watching = threading.Thread(target=_watch, args=(service, given.every_s, stop), daemon=True)
-    watching.start()
-    try:
-        serve(cast("RunnerDeployment", deployment), limit=1, print_starting_message=False)
-    finally:
-        stop.set()
-
-
-def _watch(service: Service, every_s: float, stop: threading.Event) -> None:
-    """Look into the inbox from time to time; a share that is gone for a minute ends no service."""
-    from prefect.deployments import run_deployment
-
-    while not stop.is_set():
-        try:
-            if service.is_due():
-                run_deployment(f"survey/{service.name}", timeout=0, as_subflow=False)
-                log.info("a run of %s was asked for", service.name)
-        except Exception:
-            log.exception("the inbox could not be looked at; it is tried again")
-        stop.wait(every_s)
+    deployment = Deployment(service, given.survey, out, runner, schedule(given.cron, given.timezone))
+    with prefect_api(given.server, home) as wait:
+        wait()
+        deployment.serve(every_s=given.every_s)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A Prefect server for one run, or the address of one that runs already."""
+"""A Prefect server of our own, which ends with whoever started it."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from flows.settings import START_S, answering, answers, settings
+from flows.settings import START_S, answers
 from mineloc.errors import SurveyError
 
 STOP_S = 5.0
@@ -39,25 +39,6 @@ class Starting:
             if self.process.poll() is not None or time.monotonic() > deadline:
                 raise SurveyError("prefect server", "did not start", todo="see server.log, or run with --local")
             time.sleep(0.1)
-
-
-@contextmanager
-def prefect_api(server: str | None, home: Path) -> Generator[Callable[[], None]]:
-    """Within: the environment names a server, the one at that address or one of our own with its history in `home`.
-
-    Yields what waits until it answers; import what needs prefect within, for settings count at its import.
-
-    Raises:
-        SurveyError: nobody answers at the address.
-    """
-    os.environ.update(settings(None if server else home))
-    if server:
-        os.environ["PREFECT_API_URL"] = answering(server)
-        yield lambda: None
-        return
-    with own_server(home) as ready:
-        os.environ["PREFECT_API_URL"] = ready.address
-        yield ready.wait
 
 
 @contextmanager

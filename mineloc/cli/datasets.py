@@ -212,7 +212,8 @@ def _by_flight(recordings: list[str]) -> dict[str, Path]:
     for text in recordings:
         flight, equals, path = text.partition("=")
         if not equals or Path(text).exists():
-            flight, path = Path(text).absolute().stem, text
+            place = Path(text).absolute()
+            flight, path = place.name if place.is_dir() else place.stem, text
         if flight in given:
             raise typer.BadParameter(f"two recordings for flight {flight}: write FLIGHT=RECORDING")
         given[flight] = Path(path)

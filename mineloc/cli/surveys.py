@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -54,15 +56,15 @@ def serve(
     address: AddressOption = None,
 ) -> None:
     """Reprocess a survey for good, at set times or when recordings land. E.g. serve mine.toml --watch INBOX/."""
-    from mineloc.survey.serving import become_service
-
     if cron is None and watch is None:
         raise typer.BadParameter("--cron, --watch or both")
     words = {
-        "cron": cron, "timezone": timezone, "watch": watch, "every-s": every_s, "settle-s": settle_s,
+        "out": out, "cron": cron, "timezone": timezone, "watch": watch, "every-s": every_s, "settle-s": settle_s,
         "server": server, "runner": runner, "address": address,
     }  # fmt: skip
-    become_service(survey, out, words)
+    given = [f"--{name}={value}" for name, value in words.items() if value is not None]
+    # this process becomes the service, which knows Prefect: signals reach it, and nothing is left behind it
+    os.execv(sys.executable, [sys.executable, "-P", "-m", "flows.serve", str(survey), *given])
 
 
 @app.command()

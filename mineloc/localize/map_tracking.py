@@ -116,7 +116,8 @@ class Prior:
             return tracker
 
         def search() -> Relocalizer:
-            return Relocalizer(Recognizer(config, database), config, lambda found: self._track(config, found, by))
+            # a bare tracker: the one around it goes on watching, two would search side by side
+            return Relocalizer(Recognizer(config, database), config, lambda found: self._by(config, found, by))
 
         return RecoveringTracker(
             tracker, search, contradicts_map if by == "map" else contradicts_database, config.prior_map

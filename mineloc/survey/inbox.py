@@ -15,7 +15,8 @@ from pathlib import Path
 
 from mineloc.errors import MinelocError, OutputError
 from mineloc.io.recordings import has_end, open_recording
-from mineloc.survey.spec import NAME, slug
+from mineloc.store.versions import NAME
+from mineloc.survey.spec import slug
 
 UNFINISHED = (".part", ".partial", ".tmp", ".crdownload", ".filepart", ".incomplete")
 """What programs call a copy that is not done."""

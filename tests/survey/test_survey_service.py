@@ -123,6 +123,7 @@ def test_what_lands_needs_a_dataset_that_grows(tmp_path: Path, dataset: str) -> 
     ("options", "said"),
     [
         (["--cron", "every night"], "five fields"),
+        (["--cron", "99 99 * * *"], "five fields"),
         (["--cron", "0 2 * * *", "--timezone", "Atlantis/Mine"], "--timezone"),
         (["--watch", "nowhere"], "no such folder"),
         (["--cron", "0 2 * * *", "--runner", "ray"], "process or dask"),
