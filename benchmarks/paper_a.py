@@ -8,10 +8,10 @@ the report. The prior map is the project's own reconstruction of the mapping fli
 takes off is told to 0.1 m and 1 degree, as a surveyor would. The table goes between the markers in README.md, error
 maps to `--pictures`.
 
-Needs 34 GB for the mapping flight and 34 GB a seed. What is in FOLDER already is not made again. On a smaller disk, fly
-the seeds one by one and remove each recording (and FOLDER/results/.mineloc/store, where its copy is) afterwards: a
-flight whose recording is gone is told by the runs that it left. LOAM and what is built on it take three times as long
-as all others: `--baseline-seeds` flies them on fewer flights.
+Needs 34 GB for the mapping flight and 34 GB a seed. What is in FOLDER already is not made again. The numbers of each
+flight are kept in results/paper_a/, and the table is made of all flights there: on a smaller disk, fly the seeds one by
+one, each with an empty FOLDER/results/.mineloc/store. LOAM and what is built on it take three times as long as all
+others: `--baseline-seeds` flies them on fewer flights.
 """
 
 from __future__ import annotations
@@ -21,31 +21,17 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from edgar_map import MESH, mineloc
 from error_maps import error_maps, similarity_matrices
+from paper_a_table import IN_MAP, KEPT, METHODS, keep, kept, table
 from readme_table import write_readme
 
 from mineloc.io.flight import FlightReader
 
-METHODS = (
-    "loam", "loam_scan_context", "link3d_scan_context", "intersections", "intersections_map", "map_tracking",
-)  # fmt: skip
 BASELINES = ("loam", "loam_scan_context", "link3d_scan_context")
-IN_MAP = ("intersections_map", "map_tracking")
 GRID = {"grid_e_m": 512_000, "grid_n_m": 4_398_000, "grid_z_m": 2_300, "grid_yaw_deg": 30}
-PUBLISHED = {
-    "loam": ("10.15", "39.15", "2.18", "1.32", "0.84", "1.04", "0.51"),
-    "loam_scan_context": ("2.63", "6.62", "1.09", "0.52", "0.32", "0.32", "0.22"),
-    "intersections": ("1.22", "2.22", "1.26", "0.67", "0.19", "0.28", "0.17"),
-    "intersections_map": ("0.60", "2.06", "1.38", "0.66", "0.22", "0.31", "0.13"),
-}
-COLUMNS = (
-    "method", "trajectory", "flights", "aligned", "RMSE m", "max m",
-    "REP-1 %", "REP-2 %", "REP-3 %", "REP-4 %", "REP-5 %", "coverage %", "precision %", "recall %", "times real time",
-)  # fmt: skip
 
 
 def simulated(out: Path, mesh: Path | str, length_m: float, seed: int, options: Mapping[str, float | str]) -> Path:
@@ -65,9 +51,11 @@ def start_of(flight: Path) -> tuple[list[float], int]:
     return np.round(T[:3, 3], 1).tolist(), round(float(np.degrees(np.arctan2(T[1, 0], T[0, 0]))))
 
 
-def survey_of(mapping: Path, flights: Mapping[str, Path], methods: Mapping[str, Sequence[str]]) -> str:
+def survey_of(
+    mapping: Path, flights: Mapping[str, Path], methods: Mapping[str, Sequence[str]], *, workers: int = 1
+) -> str:
     """The survey file: maps are made of the mapping flight alone; `methods` by flight."""
-    lines = ['title = "Paper A: six methods in the Edgar Mine"', "workers = 1"]
+    lines = ['title = "Paper A: six methods in the Edgar Mine"', f"workers = {workers}"]
     lines += ["", "[[flight]]", 'name = "mapping"', f"recording = {json.dumps(str(mapping))}", "methods = []"]
     for name, flight in flights.items():
         start_m, yaw_deg = start_of(flight)
@@ -84,12 +72,11 @@ def run_folder(results: Path, name: str, method: str) -> Path:
 
 
 def fly_all(chosen: argparse.Namespace, work: Path, methods: Mapping[str, Sequence[str]]) -> None:
-    """Simulate the flights and run their survey; a flight with runs and without its recording stays as it is."""
+    """Simulate the flights and run their survey; a flight that left all of its runs is not flown again."""
     missing = {
         name: of
         for name, of in methods.items()
-        if (work / f"{name}.mcap").exists()
-        or not all((run_folder(work / "results", name, method) / "metrics.json").exists() for method in of)
+        if not all((run_folder(work / "results", name, method) / "metrics.json").exists() for method in of)
     }
     if not missing:
         return
@@ -99,51 +86,9 @@ def fly_all(chosen: argparse.Namespace, work: Path, methods: Mapping[str, Sequen
         name: simulated(work / f"{name}.mcap", chosen.mesh, chosen.length_m, int(name.removeprefix("seed")), {})
         for name in missing
     }
-    (work / "survey.toml").write_text(survey_of(mapping, flights, missing), encoding="utf-8")
+    survey = survey_of(mapping, flights, missing, workers=chosen.workers)
+    (work / "survey.toml").write_text(survey, encoding="utf-8")
     mineloc("run", work / "survey.toml", "--local", "--out", work / "results")
-
-
-def rows(results: Path, methods: Mapping[str, Sequence[str]]) -> list[str]:
-    """A row a method and trajectory: of each number the worst of the flights, `methods` by flight."""
-    out: list[str] = []
-    for method in METHODS:
-        folders = [run_folder(results, name, method) for name, of in methods.items() if method in of]
-        if not folders:
-            continue
-        evaluations = [json.loads((folder / "metrics.json").read_text()) for folder in folders]
-        speeds = [json.loads((folder / "timing.json").read_text())["real_time_factor"] for folder in folders]
-        alignment = "none" if method in IN_MAP else "origin"
-        if method in PUBLISHED:
-            rep = list(PUBLISHED[method][2:])
-            out.append(_line([method, "published", "1", "not told", *PUBLISHED[method][:2], *rep, "", "", "", ""]))
-        for trajectory in ("smoothed", "online"):
-            scored = [
-                next(one for one in evaluation["trajectories"] if one["name"] == trajectory)
-                for evaluation in evaluations
-            ]
-            cells = [method, trajectory, str(len(folders)), alignment, *_errors(scored, alignment)]
-            cells.append(f"{100 * min(one['coverage']['path'] for one in scored):.1f}")
-            cells += _recognition(evaluations) if method == "intersections_map" else ["", ""]
-            out.append(_line([*cells, f"{min(speeds):.1f}"]))
-    return out
-
-
-def _errors(scored: list[dict[str, Any]], alignment: str) -> list[str]:
-    """RMSE, max and REP-1 … REP-5, the worst of the flights."""
-    apes = [
-        next(row for row in one["aligned"] if row["alignment"] == alignment)["ape"]["translation_m"] for one in scored
-    ]
-    reps = np.array([[row["literal"]["mean"] for row in one["rep"]] for one in scored]).max(axis=0)
-    return [f"{max(ape[key] for ape in apes):.3f}" for key in ("rmse", "max")] + [f"{rep:.3f}" for rep in reps]
-
-
-def _recognition(evaluations: list[dict[str, Any]]) -> list[str]:
-    found = [evaluation["recognition"] for evaluation in evaluations]
-    return [f"{100 * min(one[key] for one in found):.1f}" for key in ("precision", "recall")]
-
-
-def _line(cells: list[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
 
 
 def main() -> None:
@@ -157,6 +102,8 @@ def main() -> None:
     parser.add_argument("--baseline-seeds", type=int, nargs="*", help="of them, those that LOAM flies too")
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=METHODS)
     parser.add_argument("--pictures", type=Path, help="folder for the error maps")
+    parser.add_argument("--workers", type=int, default=1, help="runs at once; speeds are of one at a time")
+    parser.add_argument("--kept", type=Path, default=KEPT, help="folder of the numbers, a file a flight")
     parser.add_argument("--no-readme", action="store_true", help="print the table only")
     chosen = parser.parse_args()
     if not chosen.mesh.exists():
@@ -170,20 +117,24 @@ def main() -> None:
     }
     fly_all(chosen, work, methods)
     results = work / "results"
-    lines = [_line(list(COLUMNS)), "| --- | --- | ---: | --- " + "| ---: " * (len(COLUMNS) - 4) + "|"]
-    lines += rows(results, methods)
+    setting = {"mesh": chosen.mesh.stem, "length_m": chosen.length_m}
+    setting |= {"mapping_m": chosen.mapping_m, "mapping_seed": chosen.mapping_seed}
+    for name, of in methods.items():
+        keep(name, {method: run_folder(results, name, method) for method in of}, setting, into=chosen.kept)
+    names = sorted(path.stem for path in chosen.kept.glob("seed*.json"))
+    flights = [one for one in kept(names, of=chosen.kept) if one["setting"] == setting]
+    lines = table(flights)
     if chosen.pictures is not None:
         name = next(iter(methods))
         folders = {method: run_folder(results, name, method) for method in methods[name]}
         error_maps(folders, chosen.pictures / "paper_a_error_maps.png", in_map=IN_MAP)
         similarity_matrices(results / "maps" / "edgar.intersections.mcap", chosen.pictures / "paper_a_similarity.png")
-    seeds = " ".join(map(str, chosen.seeds))
-    options = f" --baseline-seeds {' '.join(map(str, baseline_seeds))}" if baseline_seeds != chosen.seeds else ""
-    options += "" if chosen.methods == list(METHODS) else f" --methods {' '.join(chosen.methods)}"
     flown = (
-        f"`python benchmarks/paper_a.py --length-m {chosen.length_m:g} --seeds {seeds}{options}`: "
-        f"map and database of a mapping flight of {chosen.mapping_m:g} m (seed {chosen.mapping_seed}, control points "
-        f"every 250 m), VLP-16, mesh `{chosen.mesh.stem}`; of each number the worst of as many flights as are told."
+        f"`python benchmarks/paper_a.py --length-m {chosen.length_m:g}`, seeds "
+        f"{', '.join(name.removeprefix('seed') for name in names)}: map and database of a mapping flight of "
+        f"{chosen.mapping_m:g} m (seed {chosen.mapping_seed}, control points every 250 m), VLP-16, mesh "
+        f"`{chosen.mesh.stem}`; of each number the worst of as many flights as are told "
+        "([flight by flight](benchmarks/results/paper_a))."
     )
     print(flown, *lines, sep="\n")
     if not chosen.no_readme:
