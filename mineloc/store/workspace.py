@@ -57,12 +57,17 @@ class Workspaces:
             lock.release()
 
     def sweep(self) -> list[str]:
-        """Remove what killed processes left behind; the names of what was removed."""
+        """Remove what killed processes left behind; the names of what was removed.
+
+        Raises:
+            OutputError: the store cannot be written.
+        """
         swept: list[str] = []
         for folder in sorted(self._temp.glob("*")):
             lock = self._lock(folder.name)
             try:
-                lock.acquire(timeout=0)
+                with one_line_errors(folder):
+                    lock.acquire(timeout=0)
             except Timeout:
                 continue
             try:

@@ -102,7 +102,8 @@ def engine(plan: Plan, listener: Listener, runner: Runner = PROCESSES, *, patien
 def _alone(plan: Plan, *, patient: bool) -> Generator[None]:
     lock = FileLock(plan.state / "lock")
     try:
-        lock.acquire(timeout=-1 if patient else 0)
+        with one_line_errors(plan.out):
+            lock.acquire(timeout=-1 if patient else 0)
     except Timeout:
         raise OutputError(
             plan.out, "another run is at work here", todo="wait until it is done or choose another --out"

@@ -214,9 +214,9 @@ def test_a_folder_that_may_not_be_written_gives_one_line(tmp_path):
         Store(tmp_path / "mine" / "store")
 
 
-@pytest.mark.parametrize("n", [1, 7])
+@pytest.mark.parametrize("n", [1, 50])
 def test_verify_names_exactly_the_objects_in_which_one_bit_was_flipped(tmp_path, n):
-    run_all(tmp_path / "store", 5)
+    run_all(tmp_path / "store", 30)
     store = Store(tmp_path / "store")
     rng = np.random.default_rng(n)
     chosen = sorted(rng.choice(store.objects.digests(), n, replace=False).tolist())

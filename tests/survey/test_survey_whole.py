@@ -1,6 +1,5 @@
 """Whole surveys with all stages: equal results wherever they are made, and the demonstration."""
 
-import hashlib
 import json
 import os
 import subprocess
@@ -8,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from small_survey import fingerprint
 
 pytestmark = pytest.mark.slow
 
@@ -21,8 +21,6 @@ length_m = 20.0
 name = "loop"
 mine = "loop"
 """
-# what takes how long differs, the report tells it, and equal Rerun recordings differ in their ids
-TIMED = ("timing.json", "run.rrd", "report.html", "report.json")
 
 
 def mineloc(*args: str, cwd: Path, **environment: str) -> str:
@@ -30,16 +28,6 @@ def mineloc(*args: str, cwd: Path, **environment: str) -> str:
     ran = subprocess.run(command, cwd=cwd, env=os.environ | environment, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr
     return ran.stdout
-
-
-def fingerprint(out: Path) -> dict[str, str]:
-    found: dict[str, str] = {}
-    for path in sorted(out.rglob("*")):
-        name = path.relative_to(out).as_posix()
-        if not path.is_file() or name.startswith(".mineloc") or path.name in TIMED:
-            continue
-        found[name] = hashlib.sha256(path.read_bytes()).hexdigest()
-    return found
 
 
 def test_results_depend_on_nothing_but_the_survey(tmp_path):
