@@ -48,18 +48,18 @@ class PatchArrays(NamedTuple):
     marked: NDArray[np.bool_]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _pack(ix: int, iy: int, iz: int) -> int:
     return ((ix + _OFFSET) << 42) | ((iy + _OFFSET) << 21) | (iz + _OFFSET)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _slot(key: int, mask: int) -> int:
     # Fibonacci hashing: the product wraps around, its upper bits depend on all bits of the key
     return ((key * -7046029254386353131) >> 24) & mask
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def find(keys: I64, rows: I32, ix: int, iy: int, iz: int) -> int:
     """Row of a voxel, -1 if it is not in the map."""
     key = _pack(ix, iy, iz)
@@ -74,7 +74,7 @@ def find(keys: I64, rows: I32, ix: int, iy: int, iz: int) -> int:
         s = (s + 1) & mask
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def insert_points(
     points: F64, arrays: PatchArrays, used: int, voxel_m: float, now: float, cap: float, touched: I32
 ) -> tuple[int, int]:
@@ -136,7 +136,7 @@ def insert_points(
     return used, hits
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def eigen_symmetric(a: F64, v: F64) -> None:
     """Eigenvalues ascending and unit eigenvectors of a symmetric 3x3 (cyclic Jacobi, exact to rounding).
 
@@ -162,7 +162,7 @@ def eigen_symmetric(a: F64, v: F64) -> None:
                     v[k, q], v[k, q + 1] = v[k, q + 1], v[k, q]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _rotate_away(a: F64, v: F64, p: int, q: int) -> None:
     """One Jacobi rotation: makes a[p, q] zero."""
     if a[p, q] == 0.0:
@@ -179,7 +179,7 @@ def _rotate_away(a: F64, v: F64, p: int, q: int) -> None:
         v[k, p], v[k, q] = c * v[k, p] - s * v[k, q], s * v[k, p] + c * v[k, q]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def fit_patches(arrays: PatchArrays, touched: I32, min_weight: float, growth: float) -> None:
     """Fit the touched patches that have grown by the share `growth` since their last fit."""
     sums, fits, fresh = arrays.sums, arrays.fits, arrays.fresh
@@ -225,7 +225,7 @@ def insert_and_fit(points: F64, now: float, arrays: PatchArrays, touched: I32, h
     return used
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True, parallel=True)
 def insert_and_fit_both(
     points: F64, now: float,
     one: PatchArrays, touched_one: I32, how_one: Insertion,
@@ -239,7 +239,7 @@ def insert_and_fit_both(
             used[1] = insert_and_fit(points, now, two, touched_two, how_two)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def reinsert(index: I64, keys: I64, rows: I32) -> None:
     """Fill an empty table with (m, 3) different voxel indices: row 0, 1, 2 …"""
     mask = len(keys) - 1

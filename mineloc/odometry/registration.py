@@ -297,7 +297,7 @@ def _accumulate(
             tally[_OTHER] += 1
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True, parallel=True)
 def _linearise(
     sweep: Thinned, T: F64, twist: F64,
     fine: PatchArrays, fine_m: float, coarse: PatchArrays, coarse_m: float, w: Weighting,

@@ -113,7 +113,7 @@ def transform_between_knots(points: F32, offsets_ns: I64, knots_ns: I64, transfo
     return out
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True, parallel=True)
 def _transform_in_parts(points: F32, offsets_ns: I64, knots_ns: I64, transforms: F64, out: F32) -> None:
     size = (len(points) + PARTS - 1) // PARTS
     for part in prange(PARTS):

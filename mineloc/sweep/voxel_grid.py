@@ -209,7 +209,7 @@ def _sum_in_voxels(points: F32 | F64, times_s: F64, weights: F64, ring: U16, vox
     return count
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True, parallel=True)
 def _sum_in_parts(
     points: F32 | F64, times_s: F64, weights: F64, ring: U16, voxels_per_m: float, sums: F64, counts: I64
 ) -> None:
