@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from small_survey import fingerprint
 
+from mineloc.survey.pool import THREAD_VARIABLES
+
 pytestmark = pytest.mark.slow
 
 SURVEY = """
@@ -28,26 +30,6 @@ def mineloc(*args: str, cwd: Path, **environment: str) -> str:
     ran = subprocess.run(command, cwd=cwd, env=os.environ | environment, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr
     return ran.stdout
-
-
-def test_results_depend_on_nothing_but_the_survey(tmp_path):
-    (tmp_path / "a").mkdir()
-    (tmp_path / "b" / "deeper").mkdir(parents=True)
-    for folder, seed, threads in ((tmp_path / "a", "1", "1"), (tmp_path / "b" / "deeper", "2", "2")):
-        (folder / "s.toml").write_text(SURVEY)
-        mineloc("run", "s.toml", "--local", cwd=folder, PYTHONHASHSEED=seed, OMP_NUM_THREADS=threads)
-    one, two = fingerprint(tmp_path / "a" / "s.results"), fingerprint(tmp_path / "b" / "deeper" / "s.results")
-    assert len(one) > 10
-    assert one == two
-
-
-def test_the_demonstration_executes_everything_once(tmp_path):
-    first = mineloc("demo", "--local", cwd=tmp_path)
-    steps = first.count("✓")
-    assert steps == 11
-    assert (tmp_path / "demo" / "report" / "report.html").exists()
-    second = mineloc("demo", "--local", cwd=tmp_path)
-    assert (second.count("✓"), second.count(" known")) == (0, steps)
 
 
 MAPPED = """
@@ -75,6 +57,27 @@ seed = 4
 name = "level"
 intersections = true
 """
+
+
+@pytest.mark.parametrize("survey", [SURVEY, MAPPED], ids=["odometry", "map"])
+def test_results_depend_on_nothing_but_the_survey(tmp_path, survey):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b" / "deeper").mkdir(parents=True)
+    for folder, seed, threads in ((tmp_path / "a", "1", "1"), (tmp_path / "b" / "deeper", "2", "2")):
+        (folder / "s.toml").write_text(survey)
+        mineloc("run", "s.toml", "--local", cwd=folder, PYTHONHASHSEED=seed, **dict.fromkeys(THREAD_VARIABLES, threads))
+    one, two = fingerprint(tmp_path / "a" / "s.results"), fingerprint(tmp_path / "b" / "deeper" / "s.results")
+    assert len(one) > 10
+    assert one == two
+
+
+def test_the_demonstration_executes_everything_once(tmp_path):
+    first = mineloc("demo", "--local", cwd=tmp_path)
+    steps = first.count("✓")
+    assert steps == 11
+    assert (tmp_path / "demo" / "report" / "report.html").exists()
+    second = mineloc("demo", "--local", cwd=tmp_path)
+    assert (second.count("✓"), second.count(" known")) == (0, steps)
 
 
 def test_another_flight_is_localized_in_the_map_of_the_first(tmp_path):
