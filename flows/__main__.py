@@ -12,7 +12,7 @@ import threading
 import traceback
 from pathlib import Path
 
-from flows.api import prefect_api
+from flows.api import Api
 from mineloc.errors import MinelocError, SurveyError
 from mineloc.survey.flow_process import error_to_line
 
@@ -43,7 +43,7 @@ def main() -> int:
 
 
 def _run(given: argparse.Namespace) -> None:
-    with prefect_api(given.server, given.out / ".mineloc" / "prefect") as wait:
+    with Api.named(given.server, given.out / ".mineloc" / "prefect").running() as wait:
         importlib.import_module("flows.survey")  # takes seconds, as the server does: both at once
         wait()
         _flow(given)

@@ -5,26 +5,42 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
-from flows.server import own_server
+from flows.server import free_address, own_server
 from flows.settings import answering, settings
 
 
-@contextmanager
-def prefect_api(server: str | None, home: Path) -> Generator[Callable[[], None]]:
-    """Within: the environment names a server, the one at that address or one of our own with its history in `home`.
+@dataclass(frozen=True, slots=True)
+class Api:
+    """An address, which the environment must name before anything imports prefect: settings count at its import.
 
-    Yields what waits until it answers; import what needs prefect within, for settings count at its import.
-
-    Raises:
-        SurveyError: nobody answers at the address.
+    Attributes:
+        address: ends with `/api`.
+        home: where a server of our own keeps its history; None: the server is there already.
     """
-    os.environ.update(settings(None if server else home))
-    if server:
-        os.environ["PREFECT_API_URL"] = answering(server)
-        yield lambda: None
-        return
-    with own_server(home) as ready:
-        os.environ["PREFECT_API_URL"] = ready.address
-        yield ready.wait
+
+    address: str
+    home: Path | None
+
+    @classmethod
+    def named(cls, server: str | None, home: Path) -> Self:
+        """At that address, or on a free port of this machine.
+
+        Raises:
+            SurveyError: nobody answers at the address.
+        """
+        api = cls(answering(server), None) if server else cls(free_address(), home)
+        os.environ.update({**settings(api.home), "PREFECT_API_URL": api.address})
+        return api
+
+    @contextmanager
+    def running(self) -> Generator[Callable[[], None]]:
+        """Within: the server is there. Yields what waits until it answers."""
+        if self.home is None:
+            yield lambda: None
+            return
+        with own_server(self.home, self.address) as starting:
+            yield starting.wait

@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import argparse
 import logging
-import os
 import sys
 import warnings
 from pathlib import Path
 
-from flows.api import prefect_api
-from flows.settings import settings
+from flows.api import Api
 from mineloc.errors import MinelocError
 from mineloc.survey.inbox import Inbox
 from mineloc.survey.runner import Runner
@@ -52,8 +50,7 @@ def _serve(given: argparse.Namespace) -> None:
     service = Service(given.survey, inbox)
     runner = Runner.named(given.runner, given.address)
     out = out_of(given.survey, given.out)
-    home = out / ".mineloc" / "prefect"
-    os.environ.update(settings(None if given.server else home))  # counts at the import of prefect
+    api = Api.named(given.server, out / ".mineloc" / "prefect")
     with warnings.catch_warnings():
         # the server makes it, if it comes to that
         warnings.filterwarnings("ignore", "Failed to create the Prefect home")
@@ -61,7 +58,7 @@ def _serve(given: argparse.Namespace) -> None:
         from flows.schedule import schedule
 
     deployment = Deployment(service, given.survey, out, runner, schedule(given.cron, given.timezone))
-    with prefect_api(given.server, home) as wait:
+    with api.running() as wait:
         wait()
         deployment.serve(every_s=given.every_s)
 

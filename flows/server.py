@@ -13,6 +13,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from flows.settings import START_S, answers
 from mineloc.errors import SurveyError
@@ -41,17 +42,32 @@ class Starting:
             time.sleep(0.1)
 
 
-@contextmanager
-def own_server(home: Path) -> Generator[Starting]:
-    """A server on a free port of this machine alone, with its history in `home`; ends with the block."""
-    home.mkdir(parents=True, exist_ok=True)
-    with socket.socket() as free, (home / "server.log").open("wb") as log:
+def free_address() -> str:
+    """Of an API on a free port of this machine alone."""
+    with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-        free.close()
-        address = f"http://127.0.0.1:{port}/api"
+        return f"http://127.0.0.1:{free.getsockname()[1]}/api"
+
+
+@contextmanager
+def own_server(home: Path, address: str) -> Generator[Starting]:
+    """A server at a free address, with its history in `home`; ends with the block."""
+    home.mkdir(parents=True, exist_ok=True)
+    where = urlsplit(address)
+    with (home / "server.log").open("wb") as log:
         process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "prefect", "server", "start", "--host", "127.0.0.1", "--port", str(port)],
+            [
+                sys.executable,
+                "-P",
+                "-m",
+                "prefect",
+                "server",
+                "start",
+                "--host",
+                "127.0.0.1",
+                "--port",
+                f"{where.port}",
+            ],
             env=os.environ | {"PREFECT_API_URL": address, "PREFECT_UI_API_URL": address},
             stdin=subprocess.DEVNULL,
             stdout=log,
