@@ -62,12 +62,15 @@ def test_killed_at_any_moment_of_adding_a_version_is_whole_or_not_there(tmp_path
     add_all(root, range(4))
     one_s = (time.monotonic() - start) / 4
     for done in range(10 * kills):
+        looked = time.monotonic()
+        versions = len(Datasets(Store(root)).versions("mine"))
+        look_s = time.monotonic() - looked  # what the process begins with, too; it grows with the history
         # on a slow disk more of them die before they did anything
-        if done >= kills and len(Datasets(Store(root)).versions("mine")) >= 4 + kills // 4:
+        if done >= kills and versions >= 4 + kills // 4:
             break
         process = FORK.Process(target=_add_for_ever, args=(root,))
         process.start()
-        time.sleep(rng.uniform(0.2, 4.0) * one_s)
+        time.sleep(rng.uniform(0.2, 4.0) * one_s + rng.uniform(0.0, 2.0) * look_s)
         assert process.pid is not None
         os.kill(process.pid, signal.SIGKILL)
         process.join()
