@@ -12,6 +12,7 @@ import numpy as np
 import open3d as o3d
 
 from mineloc.data import F64
+from mineloc.mapping.one_thread import one_thread
 from mineloc.mapping.submaps import Submap, open3d_cloud
 
 _FEWEST_KEYPOINTS = 10
@@ -52,21 +53,22 @@ def match_coarsely(
     count = len(a.points), len(b.points)
     if min(count) < _FEWEST_KEYPOINTS:
         return None
-    found = pipeline.registration_ransac_based_on_feature_matching(
-        a,
-        b,
-        features_a,
-        features_b,
-        True,
-        distance_m,
-        pipeline.TransformationEstimationPointToPoint(False),
-        3,
-        [
-            pipeline.CorrespondenceCheckerBasedOnEdgeLength(_EDGE_LENGTH),
-            pipeline.CorrespondenceCheckerBasedOnDistance(distance_m),
-        ],
-        pipeline.RANSACConvergenceCriteria(_TRIALS, _CONFIDENCE),
-    )
+    with one_thread():
+        found = pipeline.registration_ransac_based_on_feature_matching(
+            a,
+            b,
+            features_a,
+            features_b,
+            True,
+            distance_m,
+            pipeline.TransformationEstimationPointToPoint(False),
+            3,
+            [
+                pipeline.CorrespondenceCheckerBasedOnEdgeLength(_EDGE_LENGTH),
+                pipeline.CorrespondenceCheckerBasedOnDistance(distance_m),
+            ],
+            pipeline.RANSACConvergenceCriteria(_TRIALS, _CONFIDENCE),
+        )
     if found.fitness <= 0.0:
         return None
     return CoarseMatch(np.asarray(found.transformation).copy(), float(found.fitness), count)

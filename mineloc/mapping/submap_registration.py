@@ -16,6 +16,7 @@ from scipy.spatial import KDTree
 
 from mineloc import se3
 from mineloc.data import F64, I64, Bool
+from mineloc.mapping.one_thread import one_thread
 from mineloc.mapping.submaps import Submap, open3d_cloud
 
 _LOSS = 1e-6
@@ -63,16 +64,17 @@ def register_submaps(
     for distance_m in distances_m:
         is_last = distance_m == distances_m[-1]
         moving = source if is_last else source.thinned(_THINNED)
-        found = pipeline.registration_icp(
-            open3d_cloud(moving, normals=False),
-            target_cloud,
-            distance_m,
-            T,
-            pipeline.TransformationEstimationPointToPlane(pipeline.TukeyLoss(max(kernel_m, distance_m / 3.0))),
-            pipeline.ICPConvergenceCriteria(_LOSS, _LOSS, _ROUNDS),
-        )
+        with one_thread():
+            found = pipeline.registration_icp(
+                open3d_cloud(moving, normals=False),
+                target_cloud,
+                distance_m,
+                T,
+                pipeline.TransformationEstimationPointToPlane(pipeline.TukeyLoss(max(kernel_m, distance_m / 3.0))),
+                pipeline.ICPConvergenceCriteria(_LOSS, _LOSS, _ROUNDS),
+            )
         T = np.asarray(found.transformation)
-    # open3d adds up in the order of its threads: the digits that depend on that are no result
+    # the last digits depend on how a machine adds up: they are no result
     T = se3.rigid(np.round(T, _DIGITS))
     return judge(source, target, T, inlier_m=distances_m[-1])
 
