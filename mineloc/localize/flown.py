@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mineloc import se3
-from mineloc.background import prefetched
 from mineloc.config import Config
 from mineloc.data import F64, I64, Keyframe, OdometryStep, RelativePose, Trajectory
 from mineloc.errors import FlightError
@@ -17,9 +15,6 @@ from mineloc.localize.localization import Clock, FlightData, levelled_origin, se
 from mineloc.odometry.front_end import FrontEnd
 from mineloc.progress import Progress
 from mineloc.sweep.range_filter import within_range
-
-_AHEAD = 8
-"""Sweeps; a recognition or a loop takes as long as some, and their points wait in memory."""
 
 Watch = Callable[[OdometryStep], None]
 """Is shown every step of the front end, with its points."""
@@ -32,34 +27,29 @@ def front_end_steps(
     *,
     clock: Clock,
     progress: Progress,
+    watch: Watch | None = None,
 ) -> Generator[OdometryStep]:
-    """Every sweep of a flight through a front end, which runs a few sweeps ahead in a thread of its own.
-
-    A front end knows nothing of what is made of its steps, so they are the same as if each were waited for; what is
-    made of them takes a second core.
+    """Every sweep of a flight through a front end.
 
     Raises:
         FlightError: fewer than two sweeps, none with points, or time going backwards.
     """
     count, keyframes = 0, 0
-    with closing(prefetched(_steps(front_end, flight, config, clock), depth=_AHEAD)) as steps:
-        for step in steps:
-            yield step
-            count, keyframes = count + 1, keyframes + (step.keyframe is not None)
-            progress(count, None, "sweeps")
+    for sweep, imu in clock.waiting(settled(flight.steps, first_s=config.odometry.settle_s)):
+        with clock.of("odometry"):
+            step = front_end.step(within_range(sweep, config.sweep), imu)
+        if watch is not None:
+            with clock.of("watch"):
+                watch(step)
+        yield step
+        count, keyframes = count + 1, keyframes + (step.keyframe is not None)
+        progress(count, None, "sweeps")
     if count < 2:
         raise FlightError("localize", f"{count} sweeps", expected="at least two", todo="check that the LiDAR was on")
     if not keyframes:
         raise FlightError(
             "localize", "no sweep has points", expected="LiDAR returns", todo="check the ranges and the sensor"
         )
-
-
-def _steps(front_end: FrontEnd, flight: FlightData, config: Config, clock: Clock) -> Generator[OdometryStep]:
-    for sweep, imu in clock.waiting(settled(flight.steps, first_s=config.odometry.settle_s)):
-        with clock.of("odometry"):
-            step = front_end.step(within_range(sweep, config.sweep), imu)
-        yield step
 
 
 def first_origin(step: OdometryStep, T_body_lidar: F64) -> F64:
@@ -117,10 +107,7 @@ def fly(
     keyframes: list[Keyframe] = []
     edges: list[RelativePose | None] = []
     T_map_odom = np.eye(4)
-    for step in front_end_steps(front_end, flight, config, clock=clock, progress=progress):
-        if watch is not None:
-            with clock.of("watch"):
-                watch(step)
+    for step in front_end_steps(front_end, flight, config, clock=clock, progress=progress, watch=watch):
         if not steps:
             T_map_odom = first_origin(step, flight.calibration.T_body_lidar)
         if step.keyframe is not None:
