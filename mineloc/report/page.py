@@ -25,6 +25,8 @@ from mineloc.stages.run_folder import RunFolder
 SCHEMA = "mineloc.report/1"
 MAX_BYTES = 1_000_000
 _DETAILS = (1.0, 0.8, 0.6, 0.45, 0.35, 0.25, 0.15, 0.1)
+_LEAST_BYTES = 70_000
+"""A run's tables and figures with the least detail, about; so many runs that this cannot fit are not all drawn."""
 _ROWS = 15
 _PLACES, _FEWEST_PLACES = 60, 10
 _ALIGNED = {"none": "nothing aligned", "origin": "first pose laid on first pose", "se3": "fitted as a whole"}
@@ -40,6 +42,8 @@ def write_report(
     progress: Progress = quiet,
 ) -> Path:
     """Write `out` (HTML, below 1 MB, nothing outside of it is needed) and its JSON sidecar. Equal inputs, equal bytes.
+
+    All runs stand in the table at its head; where they do not all fit, only the worst have sections of their own.
 
     Args:
         runs: run folders, one or several; several are compared side by side.
@@ -98,18 +102,36 @@ def letter_of(number: int) -> str:
 
 
 def _page(facts: Sequence[RunFacts], document: Mapping[str, Any], sidecar: str, *, where: Path) -> bytes:
-    """The page with as much detail in its figures as fits."""
-    size, fitting = 0, 1.0
+    """The page with as much detail in its figures as fits; else with sections of the worst runs alone."""
+    worst = sorted(range(len(facts)), key=lambda k: _badness(facts[k].values), reverse=True)
+    count = min(len(facts), max(MAX_BYTES // _LEAST_BYTES, 1))
+    size, drawn, fitting = 0, 0.0, 1.0 if count == len(facts) else _DETAILS[-1]
+    figures: dict[int, RunFigures] = {}
+    detail = _DETAILS[-1]
+
+    def rendered(count: int) -> bytes:
+        shown = sorted(worst[:count])
+        together = methods_figure([facts[k] for k in shown], detail=detail)
+        return _rendered(document, {k: figures[k] for k in shown}, together, sidecar).encode()
+
     for detail in _DETAILS:
         if detail > fitting:
             continue
-        figures = [run_figures(one, f"run{number}", detail=detail) for number, one in enumerate(facts)]
-        page = _rendered(document, figures, methods_figure(facts, detail=detail), sidecar).encode()
+        figures = {k: run_figures(facts[k], f"run{k}", detail=detail) for k in worst[:count]}
+        page = rendered(count)
+        before, size = size, len(page)
+        if size <= MAX_BYTES:
+            return page
+        # in proportion at first, then on a line through both: no use in drawing what cannot fit
+        a_detail = (before - size) / (drawn - detail) if drawn else size / detail
+        fitting = max(detail - (size - MAX_BYTES) / a_detail, _DETAILS[-1]) if a_detail > 0 else _DETAILS[-1]
+        drawn = detail
+    while count > 1:
+        count = max(min(count - 1, count * MAX_BYTES // size), 1)
+        page = rendered(count)
         size = len(page)
         if size <= MAX_BYTES:
             return page
-        # the size falls a little slower than the detail: no use in drawing what cannot fit
-        fitting = max(detail * MAX_BYTES / size, _DETAILS[-1])
     raise OutputError(
         where,
         f"{len(facts)} runs make a page of {size / 1e6:.1f} MB",
@@ -118,7 +140,16 @@ def _page(facts: Sequence[RunFacts], document: Mapping[str, Any], sidecar: str, 
     )
 
 
-def _rendered(document: Mapping[str, Any], figures: Sequence[RunFigures], methods: str | None, sidecar: str) -> str:
+def _badness(run: Mapping[str, Any]) -> tuple[bool, bool, float]:
+    """Sorts runs: not found in the map, then without any error known, then by the largest error."""
+    is_lost = bool(run["map"]) and not run["map"]["found"]
+    if run["accuracy"] is None:
+        return is_lost, True, 0.0
+    ape = run["accuracy"]["smoothed"]["ape"][run["shown_alignment"]]
+    return is_lost, False, float(ape["translation_m"]["max"])
+
+
+def _rendered(document: Mapping[str, Any], figures: Mapping[int, RunFigures], methods: str | None, sidecar: str) -> str:
     environment = Environment(
         loader=PackageLoader("mineloc.report"),
         autoescape=True,
@@ -137,7 +168,7 @@ def _rendered(document: Mapping[str, Any], figures: Sequence[RunFigures], method
         sidecar=sidecar,
         style=Markup(style),
         # drawn by us; the only names from outside, those of intersections, are escaped there
-        figures=[{name: svg and Markup(svg) for name, svg in _named(one)} for one in figures],
+        figures={k: {name: svg and Markup(svg) for name, svg in _named(one)} for k, one in figures.items()},
         methods_figure=methods and Markup(methods),
     )
 

@@ -298,6 +298,27 @@ def test_what_exists_is_not_overwritten_and_nothing_is_left_behind(tmp_path, syn
     assert [p.name for p in tmp_path.iterdir()] == ["report.json"]
 
 
+def test_of_more_runs_than_fit_the_worst_have_sections_and_all_stand_in_the_table(tmp_path, synthetic_run, monkeypatch):
+    # 1 MB holds 14 of such runs; the rule is the same for a quarter of it
+    monkeypatch.setattr("mineloc.report.page.MAX_BYTES", 300_000)
+    runs = [synthetic_run(SyntheticRun(poses=60, seed=k, flight=f"flight {k}")) for k in range(6)]
+    page, document, html = _report(tmp_path, *runs)
+    assert len(html.encode()) < 300_000
+    shown = [value.removeprefix("run-") for tag, name, value in page.attributes if (tag, name) == ("section", "id")]
+    assert 1 <= len(shown) < 6
+    by_letter = {run["letter"]: run for run in document["runs"]}
+    errors = {
+        letter: run["accuracy"]["smoothed"]["ape"][run["shown_alignment"]]["translation_m"]["max"]
+        for letter, run in by_letter.items()
+    }
+    assert set(shown) == set(sorted(errors, key=lambda letter: -errors[letter])[: len(shown)])
+    assert shown == sorted(shown), "in the order in which they were given"
+    assert f"Below are the {len(shown)} of 6 runs" in page.text
+    assert all(f"flight {k}" in page.text for k in range(6))
+    assert all(f'href="#run-{letter}"' in html for letter in shown)
+    assert html.count('href="#run-') == len(shown)
+
+
 def test_a_page_that_cannot_be_small_enough_is_refused(tmp_path, synthetic_run, monkeypatch):
     monkeypatch.setattr("mineloc.report.page.MAX_BYTES", 20_000)
     monkeypatch.setattr("mineloc.report.page._DETAILS", (1.0, 0.2))
