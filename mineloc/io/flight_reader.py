@@ -12,11 +12,11 @@ from typing import cast
 import numpy as np
 from mcap.records import Channel
 
-from mineloc.background import prefetched
 from mineloc.data import Calibration, DepthImage, FlightInfo, GreyImage, ImuSamples, Sweep, Trajectory
 from mineloc.errors import FlightError, IngestError
 from mineloc.io import camera_images, canonical
 from mineloc.io import flight_layout as layout
+from mineloc.io.background import prefetched
 from mineloc.io.cdr_layout import CdrLayout
 from mineloc.io.mcap_chunks import RawRecord, ordered_messages, read_attachment, read_summary
 from mineloc.io.ros import COMPRESSED_IMAGE, IMAGE, IMU, ODOMETRY, POINT_CLOUD2, POSE_STAMPED

@@ -13,8 +13,8 @@ from typing import BinaryIO, Self
 from mcap.opcode import Opcode
 from mcap.records import Channel
 
-from mineloc.background import prefetched
 from mineloc.errors import IngestError
+from mineloc.io.background import prefetched
 from mineloc.io.mcap_framing import (
     MAGIC,
     MAX_RECORD_BYTES,

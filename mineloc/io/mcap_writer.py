@@ -37,8 +37,8 @@ from mcap.records import (
 )
 from numpy.typing import NDArray
 
-from mineloc.background import OrderedPipeline
 from mineloc.data import I64
+from mineloc.io.background import OrderedPipeline
 
 U8 = NDArray[np.uint8]
 MAGIC = b"\x89MCAP0\r\n"

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mineloc.background import OrderedPipeline, prefetched
+from mineloc.io.background import OrderedPipeline, prefetched
 
 
 def _threads():
