@@ -49,7 +49,7 @@ class SourceTree:
         self._package = package
         self._folder = folder
         self._imports_of: dict[Path, frozenset[str]] = {}
-        self._named = re.compile(rf"{re.escape(package)}(\.\w+)+(:\w+)?")
+        self._named = re.compile(rf"""(["'])({re.escape(package)}(?:\.\w+)+)(?::\w+)?\1""")
 
     def closure(self, module: str) -> Closure:
         """Everything that importing and running a module of the package can reach.
@@ -104,12 +104,12 @@ class SourceTree:
     def _read(self, module: str, source: Path) -> frozenset[str]:
         if source not in self._imports_of:
             package = module if source.name == "__init__.py" else module.rpartition(".")[0]
-            tree = ast.parse(source.read_bytes(), filename=str(source))
-            self._imports_of[source] = frozenset(self._imports(tree, package))
+            self._imports_of[source] = frozenset(self._imports(source, package))
         return self._imports_of[source]
 
-    def _imports(self, tree: ast.Module, package: str) -> Iterator[str]:
-        for node in ast.walk(tree):
+    def _imports(self, source: Path, package: str) -> Iterator[str]:
+        content = source.read_bytes()
+        for node in _statements(ast.parse(content, filename=str(source))):
             if isinstance(node, ast.Import):
                 yield from (alias.name for alias in node.names)
             elif isinstance(node, ast.ImportFrom):
@@ -117,8 +117,18 @@ class SourceTree:
                 yield base
                 # `from package import module` reads like `from module import name`: take both, the wrong one is no file
                 yield from (f"{base}.{alias.name}" for alias in node.names)
-            elif isinstance(node, ast.Constant) and isinstance(node.value, str) and self._named.fullmatch(node.value):
-                yield node.value.partition(":")[0]
+        for _, named in self._named.findall(content.decode()):
+            yield named
+
+
+def _statements(tree: ast.Module) -> Iterator[ast.AST]:
+    """All of them, however deep; expressions, which are nine nodes of ten, hold no import."""
+    waiting: list[ast.AST] = [tree]
+    while waiting:
+        node = waiting.pop()
+        yield node
+        for field in ("body", "orelse", "finalbody", "handlers", "cases"):
+            waiting.extend(getattr(node, field, ()))
 
 
 def _absolute(node: ast.ImportFrom, package: str) -> str:
